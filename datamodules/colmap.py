@@ -23,7 +23,8 @@ from heatsplat.datamodules.side_files import finite, json_object, read_table
 from heatsplat.datamodules.timestamps import dji_time, time_by_pattern, times_from_csv
 
 FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
-WORLD_FILE = "world.json"  # of a prepared folder: metres_per_unit of the sparse model, where GPS has told it
+# Of a prepared folder: metres_per_unit of the sparse model, and its axes, where GPS has told them.
+WORLD_FILE = "world.json"
 META_FILE = "meta.csv"  # of a published flight: file, latitude and more of each frame
 
 
@@ -37,11 +38,27 @@ def _positions(folder: Path) -> Path | None:
     return None
 
 
+def _uncertainty(image: Path) -> float | None:
+    """Standard uncertainty in °C of the temperatures of a prepared image, at their median; None where that is not known."""
+    path = image.with_suffix(".json")
+    try:
+        known = json_object(path).get("uncertainty_c") if path.is_file() else None
+    except SceneError:  # notes of another program, which need not be readable
+        return None
+    value = known.get("combined") if isinstance(known, dict) else None
+    return value if isinstance(value, float) else None
+
+
+def _world(folder: Path) -> dict[str, Any]:
+    """What the world file of a prepared folder holds; nothing without one."""
+    path = folder / WORLD_FILE
+    return json_object(path) if path.is_file() else {}
+
+
 def _scale(folder: Path) -> float | None:
     """Metres of one unit of a prepared folder's world; None where that is not known."""
-    path = folder / WORLD_FILE
-    value = json_object(path).get("metres_per_unit") if path.is_file() else None
-    return None if value is None else finite(value, f"{path}: 'metres_per_unit'")
+    value = _world(folder).get("metres_per_unit")
+    return None if value is None else finite(value, f"{folder / WORLD_FILE}: 'metres_per_unit'")
 
 
 class Colmap(SceneDataModule):
@@ -121,6 +138,10 @@ class Colmap(SceneDataModule):
         notes["encoding"] = encoding
         times, notes["time_source"] = self._times(folder, kept)
         bounds, bounds_source = self._bounds(folder)
+        if "axes" in (world := _world(folder)):
+            notes["axes"] = str(world["axes"])
+        if (uncertainty := _uncertainty(index.folder / files[kept[0]])) is not None:
+            notes["prepared_uncertainty_c"] = round(uncertainty, 2)
         if bounds:
             notes["bounds_source"] = bounds_source
 

@@ -219,7 +219,7 @@ def correct_scene(
     _write_cameras(target, scene, outcome.cameras)
     place.has_cameras()
     write_csv(target / FRAMES_FILE, outcome.rows)
-    write_world(target, metres_per_unit)
+    write_world(target, metres_per_unit, scene.notes.get("axes"))
     write_bounds(target, outcome.low, outcome.high)
     write_png(target / "report" / "correction.png", _picture(outcome.shown))
     if outcome.air_assumed:

@@ -32,7 +32,7 @@ from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.rig import settle_rig, thermal_only
 from heatsplat.preparation.stretch import Stretch
 from heatsplat.preparation.target import WORK
-from heatsplat.preparation.writer import image_name, write_world
+from heatsplat.preparation.writer import EAST_NORTH_UP, image_name, write_world
 
 log = logging.getLogger(__name__)
 
@@ -258,7 +258,7 @@ class Search:
         written = thermal_only(model, self.name_of, placed_by_photos)
         folder = self.target / "sparse" / "0"
         write_whole(written, folder, self.work)
-        write_world(self.target, None if self.origin is None else 1.0)
+        write_world(self.target, None if self.origin is None else 1.0, EAST_NORTH_UP)
         missing = self._why_not({copy for copy in self.name_of if copy not in kept}, others)
         errors = self._gps_residuals(list(written.images.values()))
         cameras = {self._device(copy): image.camera for copy, image in kept.items()}

@@ -37,6 +37,7 @@ from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.target import PARTIAL
 
 QUANTILES = np.linspace(0.0, 1.0, 41)
+EAST_NORTH_UP = "east, north, up"  # axes of a world that GPS has placed
 ENDINGS = ("png", "tiff")  # of images of greys, of temperatures
 DEAD_FRAMES = 8  # frames that dead pixels are judged from
 
@@ -187,13 +188,16 @@ def image_name(frame: ThermalFrame) -> str:
     return f"{frame.name}.{ENDINGS[frame.calibration is not None]}"
 
 
-def write_world(target: Path, metres_per_unit: float | None) -> None:
-    """Says in a prepared folder what one unit of its world is, or takes away what an earlier search said."""
+def write_world(target: Path, metres_per_unit: float | None, axes: str | None = None) -> None:
+    """Says in a prepared folder what one unit of its world is, and its axes where they are known ("east, north, up"), or takes
+    away what an earlier search said."""
     path = target / WORLD_FILE
     if metres_per_unit is None:
         path.unlink(missing_ok=True)
     else:
-        write_atomically(path, json.dumps({"metres_per_unit": metres_per_unit}) + "\n")
+        write_atomically(
+            path, json.dumps({"metres_per_unit": metres_per_unit} | ({"axes": axes} if axes else {})) + "\n"
+        )
 
 
 def write_bounds(target: Path, low: float, high: float) -> None:

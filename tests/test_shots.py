@@ -3,6 +3,7 @@
 import csv
 import logging
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,7 +14,23 @@ from weathered import CAMERA, make_scene
 from heatsplat.contracts import SceneError, View, ViewSet
 from heatsplat.io.quantities import Clock
 from heatsplat.io.tiff import read_temperature
-from heatsplat.shots import ShotFiles, checked_unseen, clock_of, shot_frames, sightings, warn_beyond_record, write_shot
+from heatsplat.shots import (
+    ShotFiles,
+    checked_unseen,
+    clock_of,
+    deviations_told,
+    shot_frames,
+    sightings,
+    warn_beyond_record,
+    write_shot,
+)
+
+
+def test_deviations_leave_out_what_the_camera_is_off_by():
+    scene = SimpleNamespace(notes={})
+    assert deviations_told(scene) == "1σ"
+    scene.notes["prepared_uncertainty_c"] = 1.02
+    assert deviations_told(scene) == "1σ, without the camera's own error (±1.0 °C, prepare)"
 
 
 def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):

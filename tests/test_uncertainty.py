@@ -14,7 +14,16 @@ from heatsplat import uncertainty
 from heatsplat.composition import build
 from heatsplat.contracts import Frame, SceneError, View, ViewSet
 from heatsplat.renderers.base import rasterization
-from heatsplat.uncertainty import WITHIN, Uncertainty, _calibrated, _pixels, _shares, evidence, redundancy
+from heatsplat.uncertainty import (
+    WITHIN,
+    Uncertainty,
+    _across_gap,
+    _calibrated,
+    _pixels,
+    _shares,
+    evidence,
+    redundancy,
+)
 
 FRAME = Frame("a", 0, CAMERA, 0.0)
 
@@ -64,6 +73,29 @@ def test_what_stands_under_a_mask_says_nothing_of_the_scene():
     filled = image.where(mask[..., None], 9.0)
     assert torch.equal(_pixels(View(FRAME, filled, mask=mask), "thermal"), image[mask].flatten())
     assert len(_pixels(View(FRAME, filled), "thermal")) == image.numel()
+
+
+@pytest.mark.parametrize(
+    ("time_s", "others_s", "share"),
+    [
+        (1.0, [], 1.0),  # images follow each other
+        (60.0, [], 1.0),
+        (100.0, [160.0, 40.0], 0.5),
+        (70.0, [100.0, 40.0], 0.75),
+        (230.0, [200.0, 200.0], 1.0),
+    ],
+)
+def test_a_gap_of_the_record_is_compared_with_what_was_recorded(time_s, others_s, share):
+    night = [*range(0, 41, 4), *range(160, 201, 5)]  # 20 images in 200 s
+    frames = [replace(FRAME, time_s=float(taken_s)) for taken_s in night]
+    scene = SimpleNamespace(train=ViewSet(frames, list), record=(0.0, 200.0))
+    assert _across_gap(scene, time_s) == (others_s, share)
+
+
+def test_what_no_held_out_pixel_has_counts_as_it_is():
+    rows, _ = recorded(noise=0.05)
+    shares, told = _calibrated([torch.cat([rows, torch.zeros(len(rows), 1).double()], dim=1)], 0.05)
+    assert torch.equal(shares[:-1], _calibrated([rows], 0.05)[0]) and shares[-1] == 1 and told
 
 
 def test_it_needs_training_views():

@@ -414,9 +414,15 @@ class SceneData:
 
     @property
     def middle_s(self) -> float | None:
-        """The middle of the training record in seconds; None where no training view has a time."""
+        """The time of the training view nearest to the middle of the record, in seconds; None where none has a time.
+
+        Between images, by day where all were taken by night, a model would only predict.
+        """
         times = [time_s for time_s in self.train.times_s if time_s is not None]
-        return (min(times) + max(times)) / 2 if times else None
+        if not times:
+            return None
+        middle_s = (min(times) + max(times)) / 2
+        return min(times, key=lambda time_s: abs(time_s - middle_s))
 
     @property
     def record(self) -> tuple[float, float]:

@@ -176,6 +176,12 @@ def sightings(scene: SceneData, depth_of: Callable[[Frame], Tensor]) -> list[Sig
     return found
 
 
+def deviations_told(scene: SceneData) -> str:
+    """What a standard deviation is of: the error of the scene, beside that of the camera where preparation knows it."""
+    known = scene.notes.get("prepared_uncertainty_c")
+    return "1σ" if known is None else f"1σ, without the camera's own error (±{known:.1f} °C, prepare)"
+
+
 def warn_beyond_record(scene: SceneData, frames: Sequence[Frame], assumption: str) -> bool:
     """Whether some frames lie beyond the training record; if so, one warning names them, the record and ``assumption``.
 
@@ -308,7 +314,13 @@ def write_shot(
                 files.add_picture(suffix, stem, _with(panels[-1], limits), title)
             if deviation is not None:
                 spread = deviation(frame)
-                panels.append(image_panel(spread[..., None], "uncertainty", Bar(0.0, widest, bar.unit, DEVIATION)))
+                panels.append(
+                    image_panel(
+                        spread[..., None],
+                        f"uncertainty, {deviations_told(scene)}",
+                        Bar(0.0, widest, bar.unit, DEVIATION),
+                    )
+                )
                 files.add_values("_uncertainty", stem, spread)
                 files.add_picture("_uncertainty", stem, _with(panels[-1], limits), title, moving=False)
             files.add_figure(stem, panels, "   ".join([title, *limits]))

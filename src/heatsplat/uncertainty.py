@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Frame, SceneError, View, ViewSet
+from heatsplat.contracts import Frame, SceneData, SceneError, View, ViewSet
 from heatsplat.geometry.coverage import Sighting, covered
 from heatsplat.physics.noise import noise_of_views
 from heatsplat.shots import at_time, sightings
@@ -26,6 +27,7 @@ ROUNDS = 60  # of the optimiser that finds them
 # synthetic scenes in two sizes, with noise of 0.5 K.
 NOISE_ERROR = 0.02
 STRIPS = 32  # of pixels, whose means tell how certain the mean of all is, though those of one strip err together
+GAP = 2.0  # usual times between two training images, beyond which the record has a gap
 LEAST = 1e-12  # image units²: of what is divided by, or whose logarithm is taken
 # Times the variance of the camera's noise is that with which a pixel tells a temperature: neighbouring pixels err together.
 STRETCHES = tuple(10.0**power for power in range(7))
@@ -137,7 +139,9 @@ class Uncertainty:
     * a floor;
     * the misfit that training left at them;
     * position: the gradient of the image times one length in the world;
-    * where there are times, the moment: how much changes in half of the time between two training images.
+    * where there are times, the moment: how much changes in half of the time between two training images;
+    * in a gap of the record, how much changes up to the nearest training image, of which half is unknown in its middle. Where no
+      held-out image lies in a gap, it counts as it is.
 
     That noise, and how much each of the others counts, is found on images that training did not see (``SceneData.val``:
     what was recorded, not the truth), by maximum likelihood of Laplace's distribution, which forgives outliers. One factor
@@ -204,9 +208,11 @@ class Uncertainty:
         self.shares, told = _calibrated(used, self.noise)
         return told
 
+    @torch.no_grad()
     def deviation(self, frame: Frame) -> Tensor:
-        """Standard deviation [H, W] of the temperature in each pixel of a frame."""
+        """Standard deviation [H, W] of the temperature in each pixel of the image of a frame."""
         variance = self._variances(frame, (self.stretch,)) @ self.shares
+        frame = replace(frame, camera=self.module.cameras.of(frame))
         unseen = ~covered(frame.camera, self.module.depth(frame), self._sightings)
         return (variance + unseen * self.prior**2).sqrt().mul(self.unit).float()
 
@@ -342,6 +348,9 @@ class Uncertainty:
             start, span = module.scene.record
             apart = span / len(module.scene.train) * (0.5 if frame.time_s < start + 0.5 * span else -0.5)
             parts.append((shown(at_time(module.scene, frame, frame.time_s + apart)) - image).square())
+            others_s, share = _across_gap(module.scene, frame.time_s)
+            changes = [(shown(at_time(module.scene, frame, time_s)) - image).square() for time_s in others_s]
+            parts.append(share * torch.stack(changes).mean(0) if changes else torch.zeros_like(image))
         return torch.stack(parts, dim=-1)
 
     def _parts(self, views: ViewSet, stretches: Sequence[float]) -> list[Tensor]:
@@ -438,6 +447,23 @@ class _Block:
         return torch.cat([row.reshape(len(row), -1) for row in rows], dim=1).cpu().double()
 
 
+def _across_gap(scene: SceneData, time_s: float) -> tuple[list[float], float]:
+    """Moments of the record as far after and before a moment as the nearest training image is, and the share of the mean
+    squared change up to them by which the moment is uncertain: that of a random walk that is known on both sides.
+
+    No moments where that image is no farther away than GAP times the usual time between two.
+    """
+    start, span = scene.record
+    before = min((time_s - taken_s for taken_s in scene.train.times_s if taken_s <= time_s), default=math.inf)
+    after = min((taken_s - time_s for taken_s in scene.train.times_s if taken_s >= time_s), default=math.inf)
+    near = min(before, after)
+    if near <= GAP * span / len(scene.train):
+        return [], 1.0
+    return [min(max(time_s + step, start), start + span) for step in (near, -near)], 1.0 / (
+        1.0 + near / max(before, after)
+    )
+
+
 def _only(rows: Tensor, stretch: int) -> Tensor:
     """Rows [P, 1 + S + V] with one of the S stretches, [P, 2 + V]."""
     return torch.cat([rows[:, :1], rows[:, 1 + stretch : 2 + stretch], rows[:, 1 + len(STRETCHES) :]], dim=1)
@@ -447,10 +473,13 @@ def _shares(rows: Tensor, noise: float) -> tuple[Tensor, float]:
     """How much of each variance is in squared residuals, [1 + V], by maximum likelihood of Laplace's distribution; its loss.
 
     Args:
-        rows: [P, 2 + V] squared residuals and variances; the first of these, which the prior bounds, counts as it is.
+        rows: [P, 2 + V] squared residuals and variances; the first of these, which the prior bounds, counts as it is, as does
+            one that none of the pixels has.
         noise: standard deviation of what the residuals have beside them.
     """
     squares, known, others = rows[:, 0], rows[:, 1] + noise**2, rows[:, 2:]
+    told = (others > 0).any(0)
+    shares, others = rows.new_ones(1 + len(told)), others[:, told]
     start = squares.mean().clamp(min=LEAST) / others.shape[1]
     logs = (start / others.mean(0).clamp(min=LEAST)).log().requires_grad_()
     optimiser = torch.optim.LBFGS([logs], max_iter=ROUNDS, line_search_fn="strong_wolfe")
@@ -466,7 +495,8 @@ def _shares(rows: Tensor, noise: float) -> tuple[Tensor, float]:
     with torch.enable_grad():
         optimiser.step(loss)
         reached = float(loss().detach())
-    return torch.cat([logs.new_ones(1), logs.detach().exp()]), reached
+    shares[1:][told] = logs.detach().exp()
+    return shares, reached
 
 
 def _calibrated(parts: Sequence[Tensor], noise: float) -> tuple[Tensor, bool]:
@@ -486,4 +516,5 @@ def _calibrated(parts: Sequence[Tensor], noise: float) -> tuple[Tensor, bool]:
     error = float(means.std(correction=min(1, len(means) - 1))) / len(means) ** 0.5
     highest = (squares - (1.0 - NOISE_ERROR) ** 2 * noise**2) / variances
     least = torch.maximum(highest.quantile(min(WITHIN + error, 1.0)) - found, -found)
-    return shares * torch.maximum(found, least), bool(found >= least)
+    told = (rows[:, 1:] > 0).any(0)
+    return torch.where(told, shares * torch.maximum(found, least), shares), bool(found >= least)

@@ -1,13 +1,18 @@
 """The table and the picture of hot and cold surfaces, of a wall whose left half is warm."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from fake_run import RANGE, WIDTH, wall, warmth
 
+from heatsplat.callbacks import surfaces
 from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE, ExtremeSurfaces
-from heatsplat.geometry.looks import surface_points
+from heatsplat.export.place import Place
+from heatsplat.geometry.alignment import Similarity
+from heatsplat.geometry.looks import Look, surface_points
 from heatsplat.io.tables import read_csv
 
 
@@ -39,3 +44,34 @@ def test_the_warm_patch_is_found(tmp_path):
 def test_images_that_are_no_temperatures_have_none(tmp_path):
     ExtremeSurfaces().on_test_epoch_end(None, SimpleNamespace(scene=wall(thermal_range=None), modality="thermal"))
     assert not list(tmp_path.iterdir())
+
+
+def test_surfaces_have_a_place_on_the_earth_where_cameras_do(monkeypatch):
+    shifted = Similarity(torch.tensor(1.0), torch.eye(3).double(), torch.tensor([599_000.0, 5_695_000.0, 0.0]).double())
+    monkeypatch.setattr(surfaces, "place_of", lambda scene, gps: Place(shifted, "EPSG:32631", "metre"))
+    monkeypatch.setattr(Place, "latitudes_longitudes", lambda self, points: [(51.4, 4.43)] * len(points))
+    scene, points = replace(wall(), positions="frames.csv"), [torch.tensor([1.0, 2.0, -3.0]).double()]
+    (told,) = surfaces.on_earth(scene, points)
+    assert told == {
+        "crs": "EPSG:32631", "east_m": 599_001.0, "north_m": 5_695_002.0, "height_m": -3.0,
+        "latitude_deg": 51.4, "longitude_deg": 4.43,
+    }  # fmt: skip
+    assert surfaces.on_earth(wall(), points) == [{}]
+
+
+def test_surfaces_lie_beside_the_points_that_were_measured():
+    scene = wall()
+    low, high = surfaces.reach(scene)
+    assert -1.5 < low[0] < -1.0 < 1.0 < high[0] < 1.5 and 3.5 < low[2] < 4.0 < high[2] < 4.5
+    assert surfaces.reach(replace(scene, notes={"points_random": 300})) is None
+
+
+def test_names_at_the_right_edge_stand_left_of_their_mark():
+    seen = Look(None, torch.ones(48, 64), torch.full((48, 64), 20.0))
+    left, right = (surfaces._marked(seen, [("C1", (column, 24.0))], 10.0, 50.0) for column in (30.0, 63.0))
+    blank = surfaces._marked(seen, [], 10.0, 50.0)
+
+    def drawn(picture):
+        return np.argwhere((picture != blank).any(-1))[:, 1]
+
+    assert drawn(right).min() < 630 - surfaces.NAME and drawn(left).max() > 300 + surfaces.MARK + 10

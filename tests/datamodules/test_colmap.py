@@ -135,10 +135,20 @@ def test_a_prepared_folder_whose_frames_had_no_times_has_none(tmp_path):
     assert loaded(tmp_path).notes["time_source"].startswith("none")
 
 
+def test_a_prepared_image_tells_how_uncertain_its_temperatures_are(tmp_path):
+    write_colmap(tmp_path, names(9))
+    assert "prepared_uncertainty_c" not in loaded(tmp_path).notes
+    for beside, told in (("[1, 2]", None), ('{"uncertainty_c": {"camera": 1.0, "combined": 1.0164}}', 1.02)):
+        (tmp_path / "images" / "frame_000.json").write_text(beside)
+        assert loaded(tmp_path).notes.get("prepared_uncertainty_c") == told
+
+
 def test_options_that_are_metadata(tmp_path):
     scene = loaded(write_colmap(tmp_path, names(9)), ambient_c=21.5, metres_per_unit=2.0)
     assert scene.ambient_c == 21.5 and scene.metres_per_unit == 2.0
-    (tmp_path / "world.json").write_text('{"metres_per_unit": 0.5}')
+    assert "axes" not in scene.notes
+    (tmp_path / "world.json").write_text('{"metres_per_unit": 0.5, "axes": "east, north, up"}')
+    assert loaded(tmp_path).notes["axes"] == "east, north, up"
     assert loaded(tmp_path).metres_per_unit == 0.5 and loaded(tmp_path, metres_per_unit=2.0).metres_per_unit == 2.0
     (tmp_path / "world.json").write_text('{"metres_per_unit": "far"}')
     with pytest.raises(SceneError, match="world.json: 'metres_per_unit'"):

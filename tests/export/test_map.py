@@ -1,10 +1,12 @@
 """GeoTIFF as rasterio reads it: what lies where on the map, and how warm it is."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from heatsplat.contracts import SceneError
 from heatsplat.export.basis import constant_basis
@@ -99,6 +101,37 @@ def test_a_quotient_is_that_of_what_a_pixel_mixes(two_plates, tmp_path, monkeypa
     assert u == pytest.approx(loss / driven, rel=1e-5)
     front = (driven - 2.0) / (1.0 - 2.0)  # share of the one before the other
     assert 0.3 < front < 0.7 and abs(u - (front * 10.0 + (1 - front) * 15.0)) > 0.2
+
+
+def test_bounds_beside_the_scene_are_refused(two_plates, tmp_path):
+    for bounds in ([51.40, 4.43, 51.41, 4.44], [500, 500, 510, 510]):
+        with pytest.raises(SceneError, match="what.bounds=.* holds no pixel of the scene, which runs from"):
+            Map(resolution=0.1, bounds=bounds, above=[0, 0, 1]).write(two_plates, tmp_path / "a.tif")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_map_has_a_picture(two_plates, tmp_path):
+    Map(resolution=0.02, bounds=[-3, -3, 3, 3], above=[0, 0, 1], unseen="keep").write(two_plates, tmp_path / "a.tif")
+    with Image.open(tmp_path / "a.png") as picture:
+        assert picture.width > 600 and picture.height > 600  # two pixels for one, and a bar beside
+
+
+def test_a_map_that_lies_elsewhere_is_told_or_refused(two_plates, tmp_path, caplog):
+    settings = {"resolution": 0.1, "above": [0, 0, 1], "unseen": "keep"}
+    Map(**settings, bounds=[-3, -3, 3, 3]).write(two_plates, tmp_path / "a.tif")
+    with rasterio.open(tmp_path / "a.tif") as file:
+        profile, values, tags = file.profile, file.read(1), file.tags()
+    with rasterio.open(tmp_path / "moved.tif", "w", **profile | {"count": 1}) as file:
+        file.write(np.roll(values, 4, axis=1) + 2.0, 1)
+        file.update_tags(**tags | {"scene": "a week later"})
+    with caplog.at_level("INFO", logger="heatsplat"):
+        Map(**settings, bounds=[-3, -3, 3, 3], against=tmp_path / "moved.tif").write(two_plates, tmp_path / "b.tif")
+    assert re.search("moved.tif lies 0.[45] metre to the east and -?0(.1)? to the north of this map", caplog.text)
+    assert "shows that shift" in caplog.text
+    with pytest.raises(
+        SceneError, match="a.tif has 60 x 60 pixels of 0.1 from .-3, 3. on, this map 60 x 60 .* from .-2, 3. on"
+    ):
+        Map(**settings, bounds=[-2, -3, 4, 3], against=tmp_path / "a.tif").write(two_plates, tmp_path / "c.tif")
 
 
 @pytest.mark.parametrize(

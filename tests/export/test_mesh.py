@@ -57,7 +57,7 @@ def test_what_is_no_number_of_views_is_refused(views):
 
 
 def test_what_cannot_be_seen_or_read_is_said(cooling, tmp_path):
-    with pytest.raises(SceneError, match=r"Give what.mesh=FILE"):
+    with pytest.raises(SceneError, match=r"Give what.mesh=FILE, .*\. Programs such as OpenMVS"):
         Mesh()
     (tmp_path / "no.ply").write_text("nothing")
     with pytest.raises(SceneError, match=r"no.ply cannot be read as a mesh"):
@@ -72,3 +72,14 @@ def test_what_cannot_be_seen_or_read_is_said(cooling, tmp_path):
     far.export(tmp_path / "far.ply")
     with pytest.raises(SceneError, match=r"no training view sees any of its 8 vertices"):
         Mesh(str(tmp_path / "far.ply"), views=2).write(cooling, tmp_path / "a.ply")
+
+
+def test_why_most_vertices_have_no_temperature_is_said(cooling, tmp_path, caplog):
+    scene = cooling.module.scene
+    near = trimesh.creation.icosphere(2, radius=0.3 * float(scene.bulk[1]))
+    near.apply_translation(scene.bulk[0].numpy())
+    far = trimesh.creation.icosphere(3)
+    far.apply_translation([1e4, 0, 0])
+    trimesh.util.concatenate([near, far]).export(tmp_path / "both.ply")
+    Mesh(str(tmp_path / "both.ply"), views=4, two_sided=True).write(cooling, tmp_path / "a.ply")
+    assert "most vertices have no temperature, as no view has them within 5 % of the distance" in caplog.text

@@ -12,15 +12,15 @@ from heatsplat.export.place import place_of
 rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (pip install -e '.[dev]')")
 
 
-def table(scene, path, columns=("file", "latitude_deg", "longitude_deg", "altitude_m")):
+def table(scene, path, columns=("file", "latitude_deg", "longitude_deg", "altitude_m"), degrees=30.0, easting=500_000):
     """Positions of cameras whose world is turned by 30 degrees and 2 m a unit, at a known place of UTM zone 32."""
     from rasterio.warp import transform
 
-    turn = math.radians(30.0)
+    turn = math.radians(degrees)
     lines = [",".join(columns)]
-    for frame in scene.train.frames:
+    for frame in scene.frames:
         x, y, z = frame.camera.center.tolist()
-        east = 500_000 + 2 * (math.cos(turn) * x - math.sin(turn) * y)
+        east = easting + 2 * (math.cos(turn) * x - math.sin(turn) * y)
         north = 5_200_000 + 2 * (math.sin(turn) * x + math.cos(turn) * y)
         (longitude,), (latitude,) = transform("EPSG:32632", "EPSG:4326", [east], [north])
         lines.append(f"{frame.name},{latitude:.12f},{longitude:.12f},{100 + 2 * z:.9f}")
@@ -40,7 +40,8 @@ def test_positions_give_the_projection_the_scale_and_the_turn(cooling, tmp_path)
 def test_tables_as_programs_write_them_and_images_of_one_name(cooling, tmp_path):
     scene = cooling.module.scene
     frames = [replace(f, name=f"{'ab'[i % 2]}/{i // 2}.png") for i, f in enumerate(scene.train.frames)]
-    twice = replace(scene, train=ViewSet(frames, lambda i: None))
+    none = ViewSet([], list)
+    twice = replace(scene, train=ViewSet(frames, lambda i: None), val=none, test=none)
     path = table(twice, tmp_path / "gps.csv")
     spot = torch.zeros(1, 3)
     expected = place_of(scene, table(scene, tmp_path / "b.csv"))(spot)
@@ -49,7 +50,7 @@ def test_tables_as_programs_write_them_and_images_of_one_name(cooling, tmp_path)
     path.write_bytes(b"\xef\xbb\xbf" + text.encode())
     assert torch.allclose(place_of(twice, path)(spot), expected, atol=1e-3)
     path.write_text(path.read_text(encoding="utf-8-sig").replace("a/", "").replace("b/", ""))
-    with pytest.raises(SceneError, match="has positions of [01] of the training images"):
+    with pytest.raises(SceneError, match="has positions of [01] of the images"):
         place_of(twice, path)
 
 
@@ -59,7 +60,52 @@ def test_the_scene_s_own_table_is_taken_unless_it_places_nothing(cooling, tmp_pa
     assert place_of(scene, "auto", torch.tensor([0.0, 0.0, 1.0])).crs is None
     (tmp_path / "few.csv").write_text("file,lat,lon,alt\nother.png,47,9,500\n")
     assert place_of(replace(scene, positions=tmp_path / "few.csv"), "auto").crs is None
-    assert "has positions of 0 of the training images" in caplog.text and "no place on the earth" in caplog.text
+    assert "has positions of 0 of the images" in caplog.text and "no place on the earth" in caplog.text
+
+
+def strip(scene, wander=0.0):
+    """The scene as cameras along a line of flight see it, in a world whose axes are east, north and up, 2 m a unit."""
+    frames = []
+    for i, frame in enumerate(scene.train.frames):
+        viewmat = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+        viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([3.0 * i, wander * (-1) ** i, 20.0], dtype=torch.float64)
+        frames.append(replace(frame, camera=replace(frame.camera, viewmat=viewmat)))
+    views, none = ViewSet(frames, lambda i: None), ViewSet([], list)
+    notes = scene.notes | {"axes": "east, north, up"}
+    return replace(scene, train=views, val=none, test=none, notes=notes, metres_per_unit=2.0, weather=None)
+
+
+def test_of_a_world_whose_axes_are_known_a_strip_tells_the_place(cooling, tmp_path):
+    """At 100 km east of the middle of the zone its north is 0.96 degrees from that of the map."""
+    scene = strip(cooling.module.scene)
+    scene = replace(scene, positions=table(scene, tmp_path / "frames.csv", degrees=0.9606, easting=600_000))
+    place = place_of(scene, "auto")
+    found = place(torch.tensor([[0.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 1.0]]))
+    assert place.crs == "EPSG:32632" and place.similarity.rotation[2, 2] == 1
+    assert place.scale == pytest.approx(2.0, rel=4e-4)  # a grid metre is not quite one on the ground
+    assert (found[0] - torch.tensor([6e5, 5.2e6, 100.0])).abs().max() < 0.05
+    assert (found[1] - found[0] - torch.tensor([-3.353, 199.97, 0.0])).abs().max() < 0.1
+
+
+def test_decimetres_do_not_tip_a_world_whose_axes_are_known(cooling, tmp_path):
+    scene = strip(cooling.module.scene, wander=0.2)
+    path = table(scene, tmp_path / "frames.csv", degrees=0.0)
+    lines = path.read_text().splitlines()
+    noisy = [lines[0]]
+    for i, line in enumerate(lines[1:]):
+        *others, height = line.split(",")
+        noisy.append(",".join([*others, str(float(height) + 0.1 * (-1) ** i)]))
+    path.write_text("\n".join(noisy))
+    below = torch.tensor([[10.0, 0.0, -10.0]])
+    expected = torch.tensor([[500_020.0, 5_200_000.0]], dtype=torch.float64)
+    assert (place_of(scene, path)(below)[:, :2] - expected).norm() < 0.1
+    with pytest.raises(SceneError, match="lie on a line .* leaves the turn about it open"):
+        place_of(replace(scene, notes={}), path)
+
+
+def test_a_world_whose_axes_are_known_is_not_turned(cooling):
+    rotation = place_of(strip(cooling.module.scene)).similarity.rotation
+    assert torch.equal(rotation, torch.eye(3, dtype=torch.float64))
 
 
 def test_without_positions_up_is_known_and_axes_are_at_right_angles(cooling):
@@ -77,7 +123,7 @@ def test_a_table_that_places_nothing_is_refused(cooling, tmp_path):
     with pytest.raises(SceneError, match="has no column latitude_deg or"):
         place_of(scene, table(scene, tmp_path / "a.csv", ("file", "phi", "lambda", "altitude_m")))
     (tmp_path / "b.csv").write_text("file,lat,lon,alt\nother.png,47,9,500\n")
-    with pytest.raises(SceneError, match="has positions of 0 of the training images"):
+    with pytest.raises(SceneError, match="has positions of 0 of the images"):
         place_of(scene, tmp_path / "b.csv")
     names = [frame.name for frame in scene.train.frames[:4]]
     rows = [f"{name},47,9.00{i},500" for i, name in enumerate(names)]

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import uniform_filter
 
 from heatsplat.contracts import Camera, Frame, SceneData, ThermalRange, View, ViewSet
-from heatsplat.export.seams import comparison, mosaic, seam_lines, smoothed, step_across
+from heatsplat.export.seams import comparison, mosaic, seam_lines, shift_between, smoothed, step_across
 from heatsplat.geometry.looks import surface_points
 
 RANGE = ThermalRange(10.0, 50.0)
@@ -52,3 +53,14 @@ def test_steps_are_those_of_the_images(flight):
     assert seam_lines(owner)[20].sum() >= 2
     picture = comparison({"images": values, "other": truth + 1, "this": truth}, owner, "°C", np.abs(values - truth))
     assert picture.ndim == 3 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_the_shift_between_maps_is_found_though_they_know_other_pixels_and_levels():
+    rng = np.random.default_rng(0)
+    ground = uniform_filter(rng.normal(size=(120, 150)), 5)
+    other = ground[20:100, 20:130].copy()
+    one = ground[17:97, 25:135] + 3.0  # lies 3 rows further down, 5 columns further to the left
+    other[:10], one[:, -20:] = np.nan, np.nan
+    rows, columns, there, here = shift_between(one, other)
+    assert (rows, columns) == (3, -5) and there > 0.999 and abs(here) < 0.5
+    assert shift_between(one * np.nan, other)[:2] == (0, 0)

@@ -45,6 +45,18 @@ def test_surfaces_are_found_where_they_are_and_as_large_as_they_are(shown):
     assert cold[0].centre.tolist() == pytest.approx([0.8, -0.7, 4.0], abs=0.03)
 
 
+def test_what_lies_far_beside_the_reconstruction_is_no_surface():
+    """A cold spot three metres behind the wall at the border of one look, which no other denies."""
+    seen = look(0.0)
+    border = torch.zeros_like(seen.values, dtype=torch.bool)
+    border[:20, :20] = True
+    wrong = Look(seen.camera, seen.depth + 3.0 * border, torch.where(border, -20.0, seen.values))
+    box = tuple(torch.tensor([-5.0, -5.0, z], dtype=torch.float64) for z in (3.8, 4.2))
+    box[1][:2] = 5.0
+    assert extremes([wrong], share=0.03)[1][0].mean == pytest.approx(-20.0)
+    assert extremes([wrong], share=0.03, box=box)[1][0].mean == pytest.approx(2.0)
+
+
 def test_nothing_is_seen_where_there_is_no_surface():
     seen = look(0.0)
     assert extremes([Look(seen.camera, torch.full_like(seen.depth, torch.inf), seen.values)]) == ([], [])

@@ -78,7 +78,15 @@ def scene():
     frames = [Frame(f"{i}.tiff", i, CAMERA, time_s=2.0 * i) for i in range(3)]
     views = ViewSet(frames, lambda i: View(frames[i], thermal=image))
     train, test, points = views.subset([0, 1]), views.subset([2]), torch.rand(30, 3)
-    return SimpleNamespace(name="floor", thermal_range=span, train=train, test=test, points=points, point_colors=None)
+    scene = {
+        "name": "floor",
+        "thermal_range": span,
+        "train": train,
+        "test": test,
+        "points": points,
+        "point_colors": None,
+    }
+    return SimpleNamespace(**scene, notes={"axes": "east, north, up"})
 
 
 def test_a_scene_becomes_a_corrected_one_that_loads(tmp_path):

@@ -121,7 +121,7 @@ def test_cameras_are_found_from_thermal_frames_with_drift_dead_pixels_and_gps_no
             (target / "images" / f"{frame.name}.tiff").symlink_to(frame.path)
         said = FindPoses(Sift(most=1500), gps_sd_m=(0.5, 0.5))(frames, target)
         models.append(read_model(target))
-        assert json.loads((target / "world.json").read_text()) == {"metres_per_unit": 1.0}
+        assert json.loads((target / "world.json").read_text()) == {"metres_per_unit": 1.0, "axes": "east, north, up"}
     assert said.values["registered"] == 24 and said.values["metres_per_unit"] == 1.0
     errors = pose_errors(torch.from_numpy(np.stack(models[0].viewmats)), torch.from_numpy(recording.viewmats))
     assert errors.degrees.median() < 0.5 and errors.percent.median() < 1.0

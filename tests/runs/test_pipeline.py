@@ -1,5 +1,7 @@
 """The steps that make a run's configuration ready, and the Python interface around them."""
 
+from dataclasses import replace
+
 import hydra
 import pytest
 import torch
@@ -49,6 +51,16 @@ def test_visible_images_are_no_temperatures(tmp_path):
     assert torch.equal(image, scene.images(frame, ["recorded"])["recorded"]) and image.shape[2] == 3
     masked = scene.render(frame)
     assert torch.equal(masked.isnan().all(2), ~scene.seen(frame))
+
+
+def test_what_was_seen_is_told_of_the_image_that_is_rendered(trained, monkeypatch):
+    """From a camera that was learned far beside the one that is given, and looks elsewhere."""
+    scene = heatsplat.load(trained[0] / "checkpoints" / "last.ckpt")
+    frame, other = (scene.scene.train.frames[i] for i in (0, len(scene.scene.train) // 2))
+    expected = {camera: scene.seen(replace(frame, camera=camera)) for camera in (frame.camera, other.camera)}
+    assert not torch.equal(*expected.values())
+    monkeypatch.setattr(scene.module.cameras, "of", lambda frame: other.camera)
+    assert torch.equal(scene.seen(frame), expected[other.camera])
 
 
 def test_a_step_changes_no_configuration_that_it_is_given(trained):

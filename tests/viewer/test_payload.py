@@ -131,3 +131,15 @@ def test_what_a_part_adds_that_needs_to_know_how_far_away_things_are():
     added = sum(in_units(block.content, one) for one in told).reshape(image.shape)
     np.testing.assert_allclose(added, 30.0 * (after.detach()[..., 0] - image), atol=told[0]["step"] + told[1]["step"])
     assert np.abs(added).max() > 1.0
+
+
+def test_a_camera_that_was_learned_stands_beside_what_it_recorded(tmp_path):
+    """Added by the sensor, and drawn beside the recorded image, is what is seen from there."""
+    module = started(tmp_path, "method=3dgs", "data.scene=static", "cameras=refined")
+    torch.nn.init.normal_(module.cameras.moves, std=5.0)
+    header, _ = payload(module, snapshot(module), cameras=2)
+    for told in header["cameras"]:
+        frame = next(frame for frame in module.scene.train.frames if frame.name == told["name"])
+        matrix = torch.tensor(told["viewmat"], dtype=torch.float64).view(3, 4)
+        assert torch.equal(matrix, module.cameras.of(frame).viewmat[:3].detach())
+        assert (matrix - frame.camera.viewmat[:3]).abs().max() > 1e-3

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from glob import escape
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import pytorch_lightning as pl
 from matplotlib.figure import Figure

@@ -88,6 +88,7 @@ def _surfaces_section(folder: Path) -> list[str]:
             f"{row['most_c']:.1f} °C",
             f"{row['area']:g} {row['unit']}",
             ", ".join(f"{row[axis]:.2f}" for axis in "xyz"),
+            *([f"{row['latitude_deg']:.6f}, {row['longitude_deg']:.6f}"] if "latitude_deg" in row else []),
         )
         for row in found
     ]
@@ -98,7 +99,8 @@ def _surfaces_section(folder: Path) -> list[str]:
         "Centres are in scene coordinates. What has no texture and is seen at a flat angle, such as bare ground, may lie less "
         f"deep than it is shown. Table: [{SURFACES_FILE}]({SURFACES_FILE})."
     )
-    table = markdown_table(("", "mean", "hottest, coldest 2 %", "area", "centre x, y, z"), rows, "lrrrr")
+    titles = ("", "mean", "hottest, coldest 2 %", "area", "centre x, y, z", "latitude, longitude")[: len(rows[0])]
+    table = markdown_table(titles, rows, "lrrrrr"[: len(titles)])
     picture = [f"![numbered surfaces]({SURFACES_PICTURE})", ""] if (folder / SURFACES_PICTURE).exists() else []
     return ["", "## Hottest and coldest surfaces", "", *picture, *table, "", note]
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytorch_lightning as pl
@@ -12,6 +14,7 @@ from torch import Tensor
 
 from heatsplat.callbacks.images import scene_bounds
 from heatsplat.contracts import Frame, SceneData, evenly_spread
+from heatsplat.export.place import AUTO, place_of
 from heatsplat.geometry.coverage import DEPTH_TOLERANCE, surface_depth
 from heatsplat.geometry.extremes import Surface, extremes
 from heatsplat.geometry.looks import Look
@@ -25,13 +28,15 @@ SURFACES_FILE = "surfaces.csv"
 SURFACES_PICTURE = "renders/surfaces.png"
 ENLARGED = 640  # pixels of the longer side of the picture's image, about
 MARK = 8  # pixels
+NAME = 24  # pixels of a name beside it
 
 
 class ExtremeSurfaces(pl.Callback):
     """Writes surfaces.csv and renders/surfaces.png at the end of the test, of scenes that have temperatures.
 
     As the model renders them, without what the camera adds, at the moment of the training image nearest to the middle of the
-    record. Areas are those of what training views see, in square metres where the scene's scale is known.
+    record. Areas are those of what training views see, in square metres where the scene's scale is known. The table tells where
+    surfaces lie in the world, and on the earth where the scene's camera positions do (``export.place``).
 
     Args:
         views: training views from which surfaces are looked for, spread evenly.
@@ -48,7 +53,7 @@ class ExtremeSurfaces(pl.Callback):
             return
         frames = [middle(scene, scene.train.frames[i]) for i in evenly_spread(len(scene.train), self.views)]
         looks = [look(module, frame) for frame in frames]
-        hot, cold = extremes(looks, self.share, self.count)
+        hot, cold = extremes(looks, self.share, self.count, reach(scene))
         metres = scene.metres_per_unit
         unit, square = ("m", metres**2) if metres else ("units", 1.0)
         rows = [
@@ -66,19 +71,45 @@ class ExtremeSurfaces(pl.Callback):
             for number, one in enumerate(found, start=1)
         ]
         if rows:
+            for row, places in zip(rows, on_earth(scene, [one.centre for one in (*hot, *cold)]), strict=True):
+                row.update(places)
             write_csv(module.output_dir / SURFACES_FILE, rows)
             write_png(module.output_dir / SURFACES_PICTURE, picture(looks, hot, cold, scene, frames[0].time_s))
 
 
-def middle(scene: SceneData, frame: Frame) -> Frame:
-    """A frame at the moment of the training image nearest to the middle of the record, small enough for a look.
+def reach(scene: SceneData) -> tuple[Tensor, Tensor] | None:
+    """Lowest and highest corner [3] of where surfaces may lie: a little beside the points of the reconstruction; None where its
+    points are made up."""
+    if "points_random" in scene.notes:
+        return None
+    beside = DEPTH_TOLERANCE * scene.distance
+    low, high = scene.box
+    return low.double() - beside, high.double() + beside
 
-    Between images, by day where all were taken by night, the model would only predict. In scenes without time, as it is.
-    """
+
+def on_earth(scene: SceneData, points: Sequence[Tensor]) -> list[dict[str, Any]]:
+    """Columns for the place of each point [3] on the earth; none where the scene does not lie there."""
+    try:
+        place = place_of(scene, AUTO) if scene.positions is not None else None
+    except ImportError:  # of the extra "export"
+        place = None
+    if place is None or place.crs is None:
+        return [{}] * len(points)
+    metres, degrees = place(torch.stack([*points])).tolist(), place.latitudes_longitudes(torch.stack([*points]))
+    return [
+        {
+            "crs": place.crs, "east_m": round(east, 2), "north_m": round(north, 2), "height_m": round(height, 2),
+            "latitude_deg": round(latitude, 7), "longitude_deg": round(longitude, 7),
+        }
+        for (east, north, height), (latitude, longitude) in zip(metres, degrees, strict=True)
+    ]  # fmt: skip
+
+
+def middle(scene: SceneData, frame: Frame) -> Frame:
+    """A frame at the moment of the training image nearest to the middle of the record, small enough for a look; in scenes
+    without time, as it is."""
     if frame.time_s is not None:
-        taken_s = (time_s for time_s in scene.train.times_s if time_s is not None)
-        middle_s = scene.middle_s
-        frame = at_time(scene, frame, min(taken_s, key=lambda time_s: abs(time_s - middle_s)))
+        frame = at_time(scene, frame, scene.middle_s)
     return replace(frame, camera=frame.camera.within(SIGHTING_SIZE))
 
 
@@ -94,7 +125,8 @@ def look(module: pl.LightningModule, frame: Frame) -> Look:
 def picture(
     looks: list[Look], hot: list[Surface], cold: list[Surface], scene: SceneData, time_s: float | None
 ) -> np.ndarray:
-    """The view that shows most of the surfaces, hot and cold ones where there is such a view, with their numbers."""
+    """The view that shows most of the surfaces, hot and cold ones where there is such a view, with their numbers; beside it the
+    one that shows most of the others."""
     marked = [(f"{kind}{i}", one.centre) for kind, found in (("H", hot), ("C", cold)) for i, one in enumerate(found, 1)]
     shown = [[(name, place) for name, point in marked if (place := _place(one, point)) is not None] for one in looks]
 
@@ -104,20 +136,33 @@ def picture(
         return min(warm, len(shown[i]) - warm), len(shown[i])
 
     best = max(range(len(looks)), key=both)
+    missing = {name for name, _ in marked} - {name for name, _ in shown[best]}
+    second = max(range(len(looks)), key=lambda i: sum(name in missing for name, _ in shown[i]))
+    found = {name for name, _ in shown[second]} & missing
     low, high = scene_bounds(scene, "thermal")
-    values = looks[best].values
-    factor = max(1, round(ENLARGED / max(values.shape)))
-    image = np.repeat(np.repeat(colorize(values, low, high), factor, axis=0), factor, axis=1)
+    title = "H hottest, C coldest" + ("" if time_s is None else f" after {moment(time_s)}")
+    nowhere = [name for name, _ in marked if name in missing - found]
+    title += f"; not in view: {', '.join(nowhere)}" if nowhere else ""
+    panels = [Panel(_marked(looks[best], shown[best], low, high), title)]
+    if found:
+        others = ", ".join(name for name, _ in marked if name in found)
+        panels.append(Panel(_marked(looks[second], shown[second], low, high), f"another view, with {others}"))
+    panels[-1] = replace(panels[-1], bar=Bar(low, high, "°C"))
+    return compose(panels)
+
+
+def _marked(one: Look, shown: Sequence[tuple[str, tuple[float, float]]], low: float, high: float) -> np.ndarray:
+    """The image of a look with names at some of its pixels (column, row)."""
+    factor = max(1, round(ENLARGED / max(one.values.shape)))
+    image = np.repeat(np.repeat(colorize(one.values, low, high), factor, axis=0), factor, axis=1)
     page = Image.fromarray(image)
     draw = ImageDraw.Draw(page)
-    for name, (column, row) in shown[best]:
+    for name, (column, row) in shown:
         x, y = column * factor, row * factor
         draw.ellipse((x - MARK, y - MARK, x + MARK, y + MARK), outline="white", width=2)
-        lettering(draw, (x + MARK + 2, y), name)
-    missing = [name for name, _ in marked if name not in dict(shown[best])]
-    title = "H hottest, C coldest" + ("" if time_s is None else f" after {moment(time_s)}")
-    title += f"; not in this view: {', '.join(missing)}" if missing else ""
-    return compose([Panel(np.asarray(page), title, Bar(low, high, "°C"))])
+        beside = MARK + 2 if x + MARK + NAME < page.width else -MARK - NAME
+        lettering(draw, (x + beside, y), name)
+    return np.asarray(page)
 
 
 def _place(one: Look, point: Tensor) -> tuple[float, float] | None:

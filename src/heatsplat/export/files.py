@@ -23,7 +23,7 @@ def write_files(
         module: a training module with its scene (``training.scene_model.SceneModel``).
         form: the format.
         folder: of the files; it is made.
-        times: seconds since the first training frame, one or several; None takes the middle of the record.
+        times: seconds since the first training frame, one or several; None takes ``SceneData.middle_s``.
         layer: as in ``export.moment.moments``.
 
     Raises:

@@ -73,7 +73,7 @@ def moments_in(
     Args:
         scene: with the training record.
         span: of time that can be asked for (``snapshot.span_of``).
-        times: seconds since the first training frame, one or several; None takes the middle of the training record.
+        times: seconds since the first training frame, one or several; None takes ``SceneData.middle_s``.
 
     Raises:
         SceneError: a moment is no number or outside the span, or there is none.
@@ -100,7 +100,7 @@ def moments(module: Any, seen: Snapshot, times: float | Sequence[float] | None, 
     Args:
         module: a training module with its scene.
         seen: its snapshot.
-        times: seconds since the first training frame, one or several; None takes the middle of the training record.
+        times: seconds since the first training frame, one or several; None takes ``SceneData.middle_s``.
         layer: "camera", "surface" or "truth" (``Layer.name``); "auto" is the surface where the model tells its temperature
             apart from what a camera gets, and the camera elsewhere.
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import logging
+import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from heatsplat.contracts import SceneData, SceneError
+from heatsplat.contracts import Frame, SceneData, SceneError
 from heatsplat.export.formats.base import optional
 from heatsplat.export.moment import Moment
 from heatsplat.geometry.alignment import Similarity, similarity_between
@@ -29,7 +30,8 @@ LATITUDES = ("latitude_deg", "latitude", "gps_lat", "lat")
 LONGITUDES = ("longitude_deg", "longitude", "gps_lon", "lon")
 HEIGHTS = ("above_takeoff_m", "altitude_m", "altitude", "rel_alt", "alt")
 AUTO = "auto"
-LEAST_SPREAD = 0.02  # positions whose second extent is below this share of the first lie on a line
+LEAST_SPREAD = 0.1  # positions whose second extent is below this share of the first lie on a line
+AXES = "east, north, up"  # of a world whose axes preparation has set by GPS (``notes["axes"]``)
 ONE_WAY = 0.95  # length of the mean viewing direction from which on all cameras look the same way
 
 
@@ -55,17 +57,26 @@ class Place:
         """Points [n, 3] float64."""
         return self.similarity(points.double())
 
+    def latitudes_longitudes(self, points: Tensor) -> list[tuple[float, float]]:
+        """Latitude and longitude (WGS 84, degrees) of points [n, 3] of the world, where it has a ``crs``."""
+        east, north, _ = self(points).T.tolist()
+        longitudes, latitudes = optional("rasterio.warp", "map").transform(self.crs, "EPSG:4326", east, north)
+        return list(zip(latitudes, longitudes, strict=True))
+
 
 def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | None = None) -> Place:
     """Where a scene lies: by a table of camera positions in a UTM zone, else with its own scale and direction of up.
+
+    Positions tell only the shift of a world whose axes are known to be east, north and up, and whose scale is: the turn about
+    a line of flight would follow from decimetres between its positions. They place any other world as a whole.
 
     Args:
         scene: with its training cameras.
         gps: CSV with the name, latitude and longitude (WGS 84, degrees) and height (metres) of camera positions; "auto" takes
             the scene's own, where it has one that places its cameras and ``above`` does not say otherwise; None takes none.
-        above: [3] direction that counts as up, in place of the scene's own; not with a table. None: that of its weather;
-            else where all cameras look the same way (a drone that looks down, a wall seen from the front) back towards
-            them; else upward in their images.
+        above: [3] direction that counts as up, in place of the scene's own; not with a table. None: that of its weather, or of
+            its axes where they are east, north and up; else where all cameras look the same way (a drone that looks down, a
+            wall seen from the front) back towards them; else upward in their images.
 
     Raises:
         SceneError: the table cannot be read, or its positions do not place the cameras.
@@ -86,6 +97,8 @@ def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | No
         up = above.double()
     elif scene.weather is not None:
         up = scene.weather.up.double()
+    elif _east_north_up(scene):
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     elif forward.norm() > ONE_WAY:
         up = -forward
     else:
@@ -93,7 +106,8 @@ def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | No
     up = normalize(up, dim=0)
     axes = torch.eye(3, dtype=torch.float64)
     # North is y of the world, unless that is (nearly) up; where the cameras look down their images' top.
-    candidates = [axes[1], images_up, axes[2], axes[0]] if scene.weather is not None else [images_up, *axes[[1, 2, 0]]]
+    known = scene.weather is not None or _east_north_up(scene)
+    candidates = [axes[1], images_up, axes[2], axes[0]] if known else [images_up, *axes[[1, 2, 0]]]
     north = next(one for one in candidates if (one - (one @ up) * up).norm() > 0.5)
     north = normalize(north - (north @ up) * up, dim=0)
     rotation = torch.stack([torch.linalg.cross(north, up), north, up])
@@ -117,41 +131,81 @@ def upright(moment: Moment) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _placed(scene: SceneData, path: Path) -> Place:
-    """By the similarity that brings the training cameras closest to their positions."""
+    """By the shift, or else the similarity, that brings the cameras closest to their positions."""
     positions = _positions(path)
     found = {
         frame.camera.center: positions[name]
-        for frame, name in zip(scene.train.frames, _named(scene, positions), strict=True)
+        for frame, name in zip(scene.frames, _named(scene.frames, positions), strict=True)
         if name is not None
     }
     if len(found) < 3:
-        names = ", ".join(frame.name for frame in scene.train.frames[:2])
-        raise SceneError(f"{path} has positions of {len(found)} of the training images ({names}, ...); 3 are needed")
+        names = ", ".join(frame.name for frame in scene.frames[:2])
+        raise SceneError(f"{path} has positions of {len(found)} of the images ({names}, ...); 3 are needed")
     degrees = torch.tensor(list(found.values()), dtype=torch.float64)
     warp = optional("rasterio.warp", "map")
-    zone = int((float(degrees[:, 1].mean()) + 180) // 6) + 1
-    crs = f"EPSG:{(32600 if float(degrees[:, 0].mean()) >= 0 else 32700) + zone}"
+    latitude, longitude = degrees[:, :2].mean(0).tolist()
+    crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + int((longitude + 180) // 6) + 1}"
     east, north = warp.transform("EPSG:4326", crs, degrees[:, 1].tolist(), degrees[:, 0].tolist())
     target = torch.tensor([east, north, degrees[:, 2].tolist()], dtype=torch.float64).T
-    spread = torch.linalg.svdvals(target - target.mean(0))
-    if spread[1] < LEAST_SPREAD * spread[0]:
-        raise SceneError(
-            f"{path}: the positions lie on a line, which leaves the turn about it open; give what.gps=null"
-        )
     source = torch.stack(list(found)).double()
-    similarity = similarity_between(source, target)
-    residual = (similarity(source) - target).square().sum(1).mean().sqrt().item()
-    log.info("%s: %d cameras placed in %s, %.2f m from their positions (rms)", path, len(found), crs, residual)
+    across, along = torch.linalg.svdvals(target - target.mean(0))[[1, 0]].tolist()
+    if _east_north_up(scene):
+        similarity = _shifted(scene.metres_per_unit, _grid_north(warp, crs, latitude, longitude), source, target)
+    elif across < LEAST_SPREAD * along:
+        raise SceneError(
+            f"{path}: the positions lie on a line ({across / along:.0%} as wide as long), which leaves the turn about it open. A "
+            "second strip beside it would tell it; prepare.py, run again, notes the axes of a folder that it has placed by GPS"
+        )
+    else:
+        similarity = similarity_between(source, target)
+    off = similarity(source) - target
+    # By what the world may be tipped about the line of flight, as far below it as the ground is.
+    height = (similarity(source)[:, 2].median() - similarity(scene.points.double())[:, 2].median()).abs().item()
+    tipped = height * off[:, 2].square().mean().sqrt().item() * len(source) ** 0.5 / max(across, 1e-9)
+    log.info(
+        "%s: %d cameras placed in %s, %.2f m from their positions (rms); %.0f m below them, the ground may be off by %.1f m "
+        "across the line of flight",
+        path, len(found), crs, off.square().sum(1).mean().sqrt().item(), height, tipped,
+    )  # fmt: skip
     return Place(similarity, crs, "metre")
 
 
-def _named(scene: SceneData, positions: Mapping[str, Any]) -> list[str | None]:
-    """By which name the position of each training image is known: its own, or that of its file where no other has it."""
+def _east_north_up(scene: SceneData) -> bool:
+    """Whether the axes of the world are known to be east, north and up, in a known scale."""
+    return scene.notes.get("axes") == AXES and scene.metres_per_unit is not None
+
+
+def _shifted(metres_per_unit: float, grid_north: tuple[float, float], source: Tensor, target: Tensor) -> Similarity:
+    """Of a world whose axes are east, north and up to a map projection: only its shift follows from points [n, 3] of both.
+
+    Args:
+        metres_per_unit: of the world.
+        grid_north: easting and northing in the projection of one metre to the north.
+        source, target: in the world, in the projection.
+    """
+    east, north = grid_north
+    stretch = math.hypot(east, north)
+    cosine, sine = north / stretch, east / stretch
+    rotation = torch.tensor([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    scale = torch.tensor(metres_per_unit * stretch, dtype=torch.float64)
+    return Similarity(scale, rotation, (target - scale * source @ rotation.T).mean(0))
+
+
+def _grid_north(warp: Any, crs: str, latitude: float, longitude: float) -> tuple[float, float]:
+    """Easting and northing in a map projection of one metre to the north of a place."""
+    angle, step = 2 * math.radians(latitude), 1e-3
+    metres = step * (111132.954 - 559.822 * math.cos(angle) + 1.175 * math.cos(2 * angle))  # of the meridian, WGS 84
+    east, north = warp.transform("EPSG:4326", crs, [longitude] * 2, [latitude - step / 2, latitude + step / 2])
+    return (east[1] - east[0]) / metres, (north[1] - north[0]) / metres
+
+
+def _named(frames: Sequence[Frame], positions: Mapping[str, Any]) -> list[str | None]:
+    """By which name the position of each image is known: its own, or that of its file where no other has it."""
     stems = Counter(Path(name).stem for name in positions)
     alone = {stem: name for stem, name in ((Path(name).stem, name) for name in positions) if stems[stem] == 1}
-    ours = Counter(Path(frame.name).stem for frame in scene.train.frames)
+    ours = Counter(Path(frame.name).stem for frame in frames)
     found = []
-    for frame in scene.train.frames:
+    for frame in frames:
         whole, stem = Path(frame.name).with_suffix("").as_posix(), Path(frame.name).stem
         found.append(whole if whole in positions else alone.get(stem) if ours[stem] == 1 else None)
     return found

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
+from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import median_filter, uniform_filter
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -100,6 +101,38 @@ def step_across(values: np.ndarray, owner: np.ndarray) -> tuple[float, int]:
             steps.setdefault(pair, []).append(step if first < second else -step)
     means = [np.mean(found) for found in steps.values() if len(found) >= LEAST]
     return (float(np.sqrt(np.mean(np.square(means)))), len(means)) if means else (float("nan"), 0)
+
+
+def shift_between(one: np.ndarray, other: np.ndarray) -> tuple[int, int, float, float]:
+    """By how many rows and columns one map lies further down and to the right than another, by where they correlate most, and
+    how much they do there and as they lie; NaN where too few pixels of both are known.
+
+    Only pixels that both maps know count (masked normalised cross-correlation; Padfield, IEEE Trans. Image Process. 21, 2012).
+
+    Args:
+        one, other: [H, W], NaN where there is none.
+    """
+    shape = [next_fast_len(2 * side - 1, real=True) for side in other.shape]
+    masks = [np.isfinite(values).astype(float) for values in (one, other)]
+    filled = [
+        np.where(m > 0, v - np.mean(v[m > 0]), 0.0) if m.any() else m for v, m in zip((one, other), masks, strict=True)
+    ]
+    spectra = [[rfft2(m, shape), rfft2(v, shape), rfft2(v**2, shape)] for v, m in zip(filled, masks, strict=True)]
+
+    def sums(of_one: int, of_other: int) -> np.ndarray:
+        return irfft2(spectra[0][of_one] * spectra[1][of_other].conj(), shape)
+
+    count = sums(0, 0).round()
+    enough = count >= max(LEAST, 0.5 * count.max())
+    number = count.clip(1.0)
+    spread = (sums(2, 0) - sums(1, 0) ** 2 / number).clip(0.0) * (sums(0, 2) - sums(0, 1) ** 2 / number).clip(0.0)
+    alike = (sums(1, 1) - sums(1, 0) * sums(0, 1) / number) / np.sqrt(spread).clip(1e-12)
+    alike[~enough] = np.nan
+    if not np.isfinite(alike).any():
+        return 0, 0, float("nan"), float("nan")
+    place = np.unravel_index(np.nanargmax(alike), alike.shape)
+    rows, columns = (int(p) - size * (p > size // 2) for p, size in zip(place, shape, strict=True))
+    return int(rows), int(columns), float(alike[place]), float(alike[0, 0])
 
 
 def seam_lines(owner: np.ndarray) -> np.ndarray:

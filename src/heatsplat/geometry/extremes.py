@@ -37,7 +37,9 @@ class Surface:
     most: float
 
 
-def extremes(looks: Sequence[Look], share: float = 0.05, count: int = 4) -> tuple[list[Surface], list[Surface]]:
+def extremes(
+    looks: Sequence[Look], share: float = 0.05, count: int = 4, box: tuple[Tensor, Tensor] | None = None
+) -> tuple[list[Surface], list[Surface]]:
     """The hottest and the coldest surfaces, the largest ``count`` of each, from the most extreme mean on.
 
     Every pixel is a piece of surface whose area follows from its neighbours' depths; a piece that several looks see
@@ -48,9 +50,14 @@ def extremes(looks: Sequence[Look], share: float = 0.05, count: int = 4) -> tupl
         looks: of the scene, at one moment.
         share: of the area.
         count: of surfaces.
+        box: lowest and highest corner [3] of where surfaces may lie: those that a look shows far beside the reconstruction, such
+            as under the ground at the border of an image, are none. None: anywhere.
     """
     parts = [_pieces(look) for look in looks]
     points, areas, values, widths = (torch.cat(column) for column in zip(*parts, strict=True))
+    if box is not None:
+        inside = ((points >= box[0]) & (points <= box[1])).all(1)
+        points, areas, values, widths = points[inside], areas[inside], values[inside], widths[inside]
     if not len(points):
         return [], []
     seen = sum(look.sees(points)[0].long() for look in looks)

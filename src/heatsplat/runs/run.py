@@ -207,8 +207,10 @@ class Trained:
         found["recorded"] = found[self.module.modality]
         return {name: found[name].cpu() for name in names}
 
+    @torch.no_grad()
     def seen(self, frame: Frame) -> Tensor:
-        """Which pixels of a frame show what some training view has seen, [H, W] bool (``geometry.coverage``)."""
+        """Which pixels of the image of a frame show what some training view has seen, [H, W] bool (``geometry.coverage``)."""
+        frame = replace(frame, camera=self.module.cameras.of(frame))
         return covered(frame.camera, self.depth(frame), self._sightings)
 
     def depth(self, frame: Frame) -> Tensor:

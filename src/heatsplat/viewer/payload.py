@@ -182,7 +182,9 @@ def _cameras(module: Any, seen: Snapshot, count: int, block: Block) -> list[dict
     told, tolerance = [], TOLERANCE_C if seen.unit else TOLERANCE_UNIT
     for i in evenly_spread(len(scene.train), count):
         view = scene.train[i]
-        camera, frame = view.camera, view.frame
+        frame = view.frame
+        with torch.no_grad():
+            camera = module.cameras.of(frame)  # the one that is rendered beside what it recorded
         low, high = seen.limits
         small = camera.within(THUMBNAIL)
         size = small.height, small.width

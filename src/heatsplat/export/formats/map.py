@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numbers
 from heatsplat.export.formats.base import Format, extra_columns, optional
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import AUTO, Place, place_of
-from heatsplat.export.seams import comparison, mosaic, smoothed
+from heatsplat.export.seams import comparison, mosaic, shift_between, smoothed
 from heatsplat.geometry.coverage import OPEN, covered, gap_free, seen_means, surface_depth
 from heatsplat.geometry.looks import surface_points
-from heatsplat.io.pictures import write_png
-from heatsplat.shots import at_time, checked_unseen, first_free_id, sightings
+from heatsplat.io.pictures import Bar, Panel, bounds_of, colorize, compose, lettering, write_png
+from heatsplat.io.quantities import moment as said
+from heatsplat.shots import at_time, checked_unseen, deviations_told, first_free_id, sightings
 from heatsplat.uncertainty import Uncertainty
 
 log = logging.getLogger("heatsplat")
@@ -27,6 +30,8 @@ log = logging.getLogger("heatsplat")
 AWAY = 1000.0  # half widths of the map from which it is seen: what stands h high is displaced by h / 1000 at its edge
 LARGEST = 8192  # pixels of a side
 DEVIATION = "standard deviation"  # band of it
+SHOWN = 1600  # pixels of the longer side of a picture at most
+MARGIN_PX = 12  # of its scale
 MARGIN = 0.02  # of the longer side, around the scene's points
 
 
@@ -45,8 +50,9 @@ class Map(Format):
         unseen: "nan", or "keep" for what the model makes of places that no training view saw.
         uncertainty: the second band is the standard deviation of each pixel's temperature (``heatsplat.uncertainty``), and
             the last ones are those of the attributes.
-        against: such a map of another run on the same scene: a picture beside the file (.png) compares this map with it and with
-            a mosaic of the recorded images, seams and all (``export.seams``). None draws none.
+        against: such a map, of another run on the same scene or of another survey of the same place: the picture beside the file
+            (.png) then compares this map with it and with a mosaic of the recorded images, seams and all (``export.seams``). None
+            draws this map alone.
     """
 
     suffix = ".tif"
@@ -81,7 +87,15 @@ class Map(Format):
         scene = moment.module.scene
         place = place_of(scene, self.gps, self.above)
         west, north, pixel, width, height = self._grid(scene, place)
+        grid = from_origin(west, north, pixel, pixel)
         other = None if self.against is None else _other(rasterio, self.against)
+        if other is not None and not (
+            other.values.shape == (height, width) and grid.almost_equals(other.grid, 1e-3 * pixel)
+        ):
+            raise SceneError(
+                f"what.against={self.against} has {_described(other.grid, *other.values.shape)}, this map "
+                f"{_described(grid, height, width)}: write both with the same what.resolution and what.bounds"
+            )
         camera = _from_above(scene, place, west, north, pixel, width, height)
         depth, bands = self._bands(moment, camera)
         log.info("map of %d x %d pixels of %.3g %s", width, height, pixel, place.unit)
@@ -94,7 +108,7 @@ class Map(Format):
             count=len(bands),
             dtype="float32",
             crs=place.crs,
-            transform=from_origin(west, north, pixel, pixel),
+            transform=grid,
             nodata=float("nan"),
             compress="deflate",
             predictor=3,
@@ -102,25 +116,36 @@ class Map(Format):
             for number, (name, band) in enumerate(bands.items(), start=1):
                 file.write(band.astype(np.float32), number)
                 file.set_band_description(number, name)
+                if name.startswith(DEVIATION):
+                    file.update_tags(number, of=deviations_told(scene))
+                    log.info("%s: %s", name, deviations_told(scene))
             file.update_tags(
-                layer=moment.layer.name, lengths=place.unit, time_s=str(moment.time_s), method=_method(moment)
+                layer=moment.layer.name,
+                lengths=place.unit,
+                time_s=str(moment.time_s),
+                method=_method(moment),
+                scene=scene.name,
             )
-        if other is not None:
-            own = next(iter(bands.values()))
-            name, values = other
-            if values.shape != own.shape:
-                raise SceneError(
-                    f"what.against={self.against} has {values.shape[1]} x {values.shape[0]} pixels, this map {width} x {height}: "
-                    "write both with the same what.resolution and what.bounds"
-                )
-            recorded, owner = mosaic(scene, surface_points(camera, smoothed(depth)))
-            names = ("images", name, _method(moment) if name != _method(moment) else f"{name}, this run")
-            maps = dict(zip(names, (recorded, values, own), strict=True))
-            spread = next((band for title, band in bands.items() if title.startswith(DEVIATION)), None)
-            write_png(path.with_suffix(".png"), comparison(maps, owner, moment.seen.unit, spread))
+        own, unit = next(iter(bands.values())), moment.seen.unit
+        if other is None:
+            write_png(path.with_suffix(".png"), _picture(own, moment, place, pixel))
+            return
+        _say_shift(other, own, pixel, place.unit, unit, self.against)
+        recorded, owner = mosaic(scene, surface_points(camera, smoothed(depth)))
+        one, this = other.method, _method(moment)
+        if other.scene != scene.name:
+            one, this = f"{one}, {other.scene}", f"{this}, {scene.name}"
+        names = ("images", one, this if one != this else f"{this}, this run")
+        maps = dict(zip(names, (recorded, other.values, own), strict=True))
+        spread = next((band for title, band in bands.items() if title.startswith(DEVIATION)), None)
+        write_png(path.with_suffix(".png"), comparison(maps, owner, unit, spread))
 
     def _grid(self, scene: SceneData, place: Place) -> tuple[float, float, float, int, int]:
-        """West and north edge, width of a pixel, columns and rows."""
+        """West and north edge, width of a pixel, columns and rows.
+
+        Raises:
+            SceneError: the bounds lie beside the scene, or there are too many pixels.
+        """
         points = place(scene.points)[:, :2]
         pixel = self.resolution
         if pixel is None:
@@ -134,6 +159,13 @@ class Map(Format):
             west, south, east, north = *(low - around).tolist(), *(high + around).tolist()
         else:
             west, south, east, north = map(float, self.bounds)
+            (left, bottom), (right, top) = points.amin(0).tolist(), points.amax(0).tolist()
+            if west > right or east < left or south > top or north < bottom or min(east - west, north - south) < pixel:
+                raise SceneError(
+                    f"what.bounds={list(self.bounds)} holds no pixel of the scene, which runs from {left:.1f} to {right:.1f} in "
+                    f"x (west, east) and from {bottom:.1f} to {top:.1f} in y (south, north), "
+                    + (f"in metres of {place.crs}, not in degrees" if place.crs else f"in the map's {place.unit}")
+                )
         width, height = (max(1, round((end - start) / pixel)) for start, end in ((west, east), (south, north)))
         if max(width, height) > LARGEST:
             raise SceneError(
@@ -177,13 +209,64 @@ def _method(moment: Moment) -> str:
     return str(moment.module.config.get("name") or type(moment.module.thermal).__name__)
 
 
-def _other(rasterio: Any, path: Path) -> tuple[str, np.ndarray]:
-    """The method and the first band of a map. Raises SceneError where it cannot be read."""
+@dataclass(frozen=True)
+class _Other:
+    """A map that was written before: its method and scene, first band [H, W], and how pixels become coordinates."""
+
+    method: str
+    scene: str
+    values: np.ndarray
+    grid: Any
+
+
+def _other(rasterio: Any, path: Path) -> _Other:
+    """A map that was written before. Raises SceneError where it cannot be read."""
     try:
         with rasterio.open(path) as file:
-            return file.tags().get("method", path.stem), file.read(1)
+            tags = file.tags()
+            return _Other(tags.get("method", path.stem), tags.get("scene", path.stem), file.read(1), file.transform)
     except rasterio.errors.RasterioIOError as error:
         raise SceneError(f"what.against={path} cannot be read: {error}") from error
+
+
+def _described(grid: Any, height: int, width: int) -> str:
+    return f"{width} x {height} pixels of {grid.a:g} from ({grid.c:.10g}, {grid.f:.10g}) on"
+
+
+def _say_shift(other: _Other, own: np.ndarray, pixel: float, unit: str, values: str, path: Path | None) -> None:
+    """Logs how far another map lies from this one and by how much it is warmer; warns where that is more than a pixel."""
+    rows, columns, there, here = shift_between(other.values, own)
+    apart = other.values - own
+    level = float(np.nanmedian(apart)) if np.isfinite(apart).any() else float("nan")
+    moved = max(abs(rows), abs(columns)) > 1
+    (log.warning if moved else log.info)(
+        "what.against=%s lies %.3g %s to the east and %.3g to the north of this map, by how they correlate (%.3f there, %.3f as "
+        "they lie)%s",
+        path, columns * pixel, unit, (0 - rows) * pixel, there, here, "; a difference of the two shows that shift" * moved,
+    )  # fmt: skip
+    log.info("what.against is %.2f %s warmer than this map in the median, which their difference holds", level, values)
+
+
+def _picture(values: np.ndarray, moment: Moment, place: Place, pixel: float) -> np.ndarray:
+    """A map in colours, with a bar of them and a scale of lengths."""
+    known = values[np.isfinite(values)]
+    low, high = bounds_of(known) if len(known) else moment.seen.limits
+    step = -(-max(values.shape) // SHOWN)
+    image = colorize(values[::step, ::step], low, high)
+    factor = max(1, SHOWN // (2 * max(image.shape)))
+    page = Image.fromarray(np.repeat(np.repeat(image, factor, axis=0), factor, axis=1))
+    a_pixel = pixel * step / factor
+    length = 10.0 ** np.floor(np.log10(0.5 * page.width * a_pixel))
+    end = MARGIN_PX + length / a_pixel
+    draw = ImageDraw.Draw(page)
+    for colour, wide in (("black", 6), ("white", 2)):
+        draw.line((MARGIN_PX, page.height - MARGIN_PX, end, page.height - MARGIN_PX), fill=colour, width=wide)
+    lettering(
+        draw, (end + MARGIN_PX, page.height - MARGIN_PX), f"{length:g} {'m' if place.unit == 'metre' else 'units'}"
+    )
+    title = moment.module.scene.name + ("" if moment.time_s is None else f" after {said(moment.time_s)}")
+    title += f", north up, {place.crs}" if place.crs else ""
+    return compose([Panel(np.asarray(page), title, Bar(low, high, moment.seen.unit))])
 
 
 def _from_above(

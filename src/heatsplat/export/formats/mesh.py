@@ -13,6 +13,7 @@ from plyfile import PlyData, PlyElement
 from heatsplat.contracts import SceneError, check_count, evenly_spread
 from heatsplat.export.formats.base import Format, checked_range, optional
 from heatsplat.export.moment import Moment
+from heatsplat.geometry.coverage import DEPTH_TOLERANCE
 from heatsplat.geometry.looks import values_at
 from heatsplat.io.pictures import colorize
 
@@ -45,7 +46,10 @@ class Mesh(Format):
         two_sided: bool = False,
     ) -> None:
         if mesh is None:
-            raise SceneError("which mesh? Give what.mesh=FILE, in the coordinates of the scene")
+            raise SceneError(
+                "which mesh? Give what.mesh=FILE, in the coordinates of the scene. Programs such as OpenMVS or Metashape make "
+                "one of the same images and cameras, Open3D or MeshLab one of the points of what=las (Poisson)"
+            )
         if views is not None:
             check_count("what.views", views)
         self.mesh, self.views, self.two_sided = Path(mesh).expanduser(), views, two_sided
@@ -74,7 +78,14 @@ class Mesh(Format):
                 f"what.mesh={self.mesh}: no training view sees any of its {len(points)} vertices. Is it in the coordinates of "
                 "the scene, and do its normals point outward (what.two_sided=true takes them as they are)?"
             )
-        log.info("%d of %d vertices are seen by %d views", values.isfinite().sum(), len(points), len(looks))
+        count = int(values.isfinite().sum())
+        log.info("%d of %d vertices are seen by %d views", count, len(points), len(looks))
+        if count < len(points) / 2:
+            log.warning(
+                "what.mesh=%s: most vertices have no temperature, as no view has them within %.0f %% of the distance at which "
+                "the splats show a surface%s", self.mesh, 100 * DEPTH_TOLERANCE,
+                "" if self.two_sided else ", on the side of their normals (what.two_sided=true takes both)",
+            )  # fmt: skip
         colours = colorize(values[:, None], *(self.range_c or moment.seen.limits), self.colormap)[:, 0]
         name = f"{moment.quantity}_c" if moment.seen.unit else moment.quantity
         kinds = [(axis, "f8") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")] + [(name, "f4")]
