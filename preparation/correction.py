@@ -185,6 +185,7 @@ def correct_scene(
     few = views.frames[:: max(1, len(views) // 8)]
     far = typical_distance(few, depth_of) * metres_per_unit
     doubts = [_doubt(few, depth_of, scene.points), "" if index is None else _unsettled(few, depth_of, scene.points)]
+    doubts += [doubt.rstrip(".") for doubt in given.doubts()]
     for doubt in filter(None, doubts):
         log.warning("%s", doubt)
 
@@ -481,7 +482,6 @@ def _section(outcome: Outcome, far: float, index: float | None, doubts: Sequence
             "percentiles_c": dict(zip(map(str, PERCENT), quantiles.tolist(), strict=True)),
         }
     lines = [
-        *(line for doubt in doubts if doubt for line in (f"**{doubt}.**", "")),
         f"{len(outcome.cameras)} images, against one distance of {float(conditions.distance_m):.1f} m for all pixels (the "
         f"scene's median is {far:.1f} m) and an emissivity of {float(conditions.emissivity):g} at every angle. Air "
         f"{float(conditions.air_k) - KELVIN_AT_0_C:.1f} °C, {100 * float(conditions.humidity):.0f} %, reflected "
@@ -498,4 +498,6 @@ def _section(outcome: Outcome, far: float, index: float | None, doubts: Sequence
         "![distance, angle, temperature and change](report/correction.png)",
     ]
     angle = "" if index is None else " and an angle"
-    return Section(f"What a distance{angle} for each pixel changes", lines, values)
+    return Section(
+        f"What a distance{angle} for each pixel changes", lines, values, [f"{doubt}." for doubt in doubts if doubt]
+    )

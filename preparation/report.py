@@ -18,7 +18,7 @@ from heatsplat.contracts import evenly_spread
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import literal
 from heatsplat.io.tables import markdown_table
-from heatsplat.physics.radiometry import LIMITS, measured_signal, surface_temperature, uncertainty
+from heatsplat.physics.radiometry import LIMITS, Conditions, measured_signal, surface_temperature, uncertainty
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import InputUncertainty
 from heatsplat.preparation.devices import devices_of
@@ -44,6 +44,9 @@ APPARENT = (
     "Apparent temperatures: emissivity is 1, and neither air nor window is corrected; files and settings say nothing else. "
     "`conditions.emissivity=0.95 conditions.reflected_c=5 conditions.distance_m=20` would."
 )
+LARGE_K = (
+    20.0  # by which conditions change the temperature of half of the pixels; under a clear sky metals have more (ours)
+)
 NEUTRAL = {"emissivity": 1.0, "distance_m": 0.0, "window_transmission": 1.0}
 
 
@@ -55,16 +58,20 @@ class Section:
         title: of the heading.
         lines: Markdown; pictures are linked by their names relative to the prepared folder.
         values: what a program may want to read of it, as plain JSON values.
+        findings: what is wrong or doubtful, a sentence or two each; they stand at the top of the page.
     """
 
     title: str
     lines: list[str]
     values: dict[str, object] = field(default_factory=dict)
+    findings: list[str] = field(default_factory=list)
 
 
 def write_report(target: Path, sections: Sequence[Section], made: str = PREPARED) -> Path:
-    """Writes report.md, and report.html with the pictures in it; returns the path of the first."""
+    """Writes report.md, and report.html with the pictures in it; returns the path of the first. All findings stand first."""
     lines = [f"# {plain(target.name)}, {made}", ""]
+    if findings := dict.fromkeys(finding for section in sections for finding in section.findings):
+        lines += ["## Findings", "", *(f"- {finding}" for finding in findings), ""]
     for section in sections:
         lines += [f"## {section.title}", "", *section.lines, ""]
     text = "\n".join(lines)
@@ -78,8 +85,14 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def recording(frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> Section:
-    """What was read."""
+def recording(
+    frames: Sequence[ThermalFrame],
+    records: Sequence[Mapping[str, Any]],
+    notes: Sequence[str],
+    doubts: Sequence[str] = (),
+) -> Section:
+    """What was read; ``doubts`` about the settings are its findings."""
+    findings = list(doubts)
     devices = devices_of(frames)
     lines = [f"- {counted(len(frames), 'frame')}, camera {devices[0].label}"]
     if len(devices) > 1:
@@ -104,15 +117,20 @@ def recording(frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any
         lines.append(
             f"- {min(q[0] for q in known):.2f} .. {max(q[-1] for q in known):.2f} °C" if known else "- no temperature"
         )
-    return Section("The recording", [*lines, *(f"- {note}" for note in notes)])
+        if not known:
+            findings.append("No pixel has a temperature under these settings: check `conditions` and `counts`.")
+    return Section("The recording", [*lines, *(f"- {note}" for note in notes)], findings=findings)
 
 
 def radiometry(
-    frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]], uncertain: InputUncertainty
+    frames: Sequence[ThermalFrame],
+    records: Sequence[Mapping[str, Any]],
+    uncertain: InputUncertainty,
 ) -> Section | None:
     """What each condition is, where it comes from, what it changes and what uncertainty it brings; None for greys.
 
-    At the temperatures that 5 %, half and 95 % of the pixels of the frame in the middle lie below.
+    At the temperatures that 5 %, half and 95 % of the pixels of the frame in the middle lie below. Its findings are
+    what a thermographer would ask about.
     """
     usable = [i for i, r in enumerate(records) if frames[i].calibration is not None and r["quantiles"]]
     if not usable:
@@ -166,7 +184,17 @@ def radiometry(
         *markdown_table(["input", "±", *(f"at {x:.1f} °C" for x in celsius.tolist())], unsure, "llrrr"),
     ]
     values = {"combined_c": parts["combined"].tolist(), "at_c": celsius.tolist()}
-    return Section("Radiometry", lines + _doubts(frames), values)
+    apparent_c, surface_c = (
+        float(surface_temperature(signal, response, Conditions())[1]) - KELVIN_AT_0_C,
+        float(celsius[1]),
+    )
+    findings = _doubts(frames)
+    if abs(surface_c - apparent_c) > LARGE_K:
+        findings.append(
+            f"The conditions turn an apparent {apparent_c:.1f} °C, the median of {plain(frame.name)}, into {surface_c:.1f} °C. "
+            "Check emissivity, reflected temperature and window under Radiometry."
+        )
+    return Section("Radiometry", lines, values, findings)
 
 
 def _is_corrected(frame: ThermalFrame) -> bool:
@@ -182,9 +210,14 @@ def _plus_minus(name: str, value: float) -> str:
 def _doubts(frames: Sequence[ThermalFrame]) -> list[str]:
     """What the files say and a thermographer would ask about."""
     found = []
-    if any(f.conditions.window_transmission < 1 and f.sources.get("window_transmission") == "file" for f in frames):
+    behind = [
+        f for f in frames if f.conditions.window_transmission < 1 and f.sources.get("window_transmission") == "file"
+    ]
+    if behind:
         found.append(
-            "The files say that a window was in front of the camera. If there was none, set conditions.window_transmission=1."
+            f"The files of {counted(len(behind), 'frame')}, such as {plain(behind[0].name)}, say that a window of "
+            f"{float(behind[0].conditions.window_transmission):g} was in front of the camera. If there was none, set "
+            "conditions.window_transmission=1."
         )
     for f in frames:
         high = f.position.above_takeoff_m if f.position else None
@@ -195,7 +228,7 @@ def _doubts(frames: Sequence[ThermalFrame]) -> list[str]:
                 f"conditions.distance_m={high:.0f} corrects the air."
             )
             break
-    return ["", *(f"**{text}**" for text in found)] if found else []
+    return found
 
 
 def pictures(target: Path, frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]]) -> Section:
