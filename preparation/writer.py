@@ -6,7 +6,6 @@ that was stopped goes on where it was, and one with another emissivity makes the
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -33,6 +32,7 @@ from heatsplat.physics.radiometry import LIMITS, Conditions, PlanckResponse, mea
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import InputUncertainty
 from heatsplat.preparation.devices import devices_of
+from heatsplat.preparation.fingerprint import fingerprint
 from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.target import PARTIAL
 
@@ -109,9 +109,8 @@ class Writer:
 
     def _made_of(self, frame: ThermalFrame) -> str:
         file = frame.path.stat()
-        parts = [str(frame.path), frame.number, file.st_size, file.st_mtime_ns, self.keep_counts, repr(frame)]
         dead = np.flatnonzero(self.dead[frame.name]).tolist() if frame.name in self.dead else []
-        return hashlib.sha256(json.dumps([*parts, repr(self.uncertain), dead]).encode()).hexdigest()[:32]
+        return fingerprint(frame, file.st_size, file.st_mtime_ns, self.keep_counts, self.uncertain, dead)
 
     def _record(self, frame: ThermalFrame, pixels: np.ndarray) -> dict[str, Any]:
         finite = np.isfinite(pixels)
