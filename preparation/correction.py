@@ -57,6 +57,7 @@ GRAZING = 0.17  # cosine of 80°: beyond, a smooth surface is an idea
 PERCENT = (1, 5, 50, 95, 99)
 ASSUMED = "Nothing says what air the scene was recorded in, so 20 °C and 50 % are assumed"
 TURNED, FEW_POINTS = 15.0, 30  # degrees by which views may disagree on normals (ours), and points that tell it
+NEARLY_ALL, MANY = 0.99, 0.1  # quantile of the points' depths, and share of pixels beyond it that is too many (ours)
 APART = (
     0.1  # by which distances of splats and of measured points may differ: the air changes as little with them (ours)
 )
@@ -184,7 +185,11 @@ def correct_scene(
     views = _by_name(scene)
     few = views.frames[:: max(1, len(views) // 8)]
     far = typical_distance(few, depth_of) * metres_per_unit
-    doubts = [_doubt(few, depth_of, scene.points), "" if index is None else _unsettled(few, depth_of, scene.points)]
+    doubts = [
+        _doubt(few, depth_of, scene.points),
+        _beyond(few, depth_of, scene.points),
+        "" if index is None else _unsettled(few, depth_of, scene.points),
+    ]
     doubts += [doubt.rstrip(".") for doubt in given.doubts()]
     for doubt in filter(None, doubts):
         log.warning("%s", doubt)
@@ -361,6 +366,26 @@ def _doubt(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
     return (
         f"The trained surfaces lie {100 * abs(off):.0f} % {'farther' if off > 0 else 'nearer'} than the points that the "
         "reconstruction measured (median): distances are not settled; train longer (preset=fast, balanced)"
+    )
+
+
+def _beyond(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
+    """What to say where many pixels are farther than nearly any point that was measured in their image; empty where few are."""
+    beyond = []
+    for frame in few:
+        camera, depth = frame.camera, depth_of(frame)
+        _, within = _pixels(camera, points)
+        if within.any():
+            farthest = camera.project(points[within])[1].double().quantile(NEARLY_ALL)
+            known = depth[depth.isfinite()]
+            beyond.append((known > (1.0 + APART) * farthest).double())
+    share = float(torch.cat(beyond).mean()) if beyond else 0.0
+    if not share > MANY:
+        return ""
+    return (
+        f"{100 * share:.0f} % of the pixels lie farther than the points that the reconstruction measured in their images: where "
+        "surfaces have no texture distances are not settled; train longer (preset=fast, balanced), or look at the picture of "
+        "distances"
     )
 
 

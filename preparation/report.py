@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from heatsplat.callbacks.page import PAGE_FILE, plain, write_page
 from heatsplat.contracts import evenly_spread
+from heatsplat.datamodules.timestamps import instant
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import literal
 from heatsplat.io.tables import markdown_table
@@ -29,6 +31,8 @@ from heatsplat.preparation.writer import QUANTILES, rows
 BINS = 160
 SHOWN, ACROSS = 6, 3  # frames that are shown, and how many of them in a row
 LOW, MIDDLE, HIGH = 2, len(QUANTILES) // 2, len(QUANTILES) - 3  # 5 %, 50 % and 95 % of the pixels
+DAY_S = 86400.0
+TIMES = ((DAY_S, "days"), (3600.0, "hours"), (60.0, "minutes"), (1.0, "seconds"))
 LABELS = {
     "emissivity": "emissivity",
     "reflected_k": "reflected temperature",
@@ -107,6 +111,7 @@ def recording(
         zones = "" if all(t.tzinfo for t in timed) else " (without a zone; zone=Europe/Berlin would say which)"
         ends = dict.fromkeys(time.isoformat() for time in (timed[0], timed[-1]))
         lines.append(f"- with a time: {len(timed)}, {' to '.join(ends)}{zones}")
+        findings += _days_apart([frame for frame in frames if frame.time is not None])
     lines.append(f"- with a GPS position: {sum(f.position is not None for f in frames)}")
     if photos := sum(r["photo"] is not None for r in records):
         lines.append(f"- with a photo of the same moment: {photos}")
@@ -120,6 +125,19 @@ def recording(
         if not known:
             findings.append("No pixel has a temperature under these settings: check `conditions` and `counts`.")
     return Section("The recording", [*lines, *(f"- {note}" for note in notes)], findings=findings)
+
+
+def _days_apart(timed: Sequence[ThermalFrame]) -> list[str]:
+    """What to say where the longest pause between frames is one of days."""
+    ordered = sorted(timed, key=lambda frame: instant(frame.time))
+    pauses = [(instant(after.time) - instant(before.time), before, after) for before, after in pairwise(ordered)]
+    length, before, after = max(pauses, key=lambda pause: pause[0], default=(0.0, None, None))
+    if length < 2 * DAY_S:
+        return []
+    return [
+        f"{length / DAY_S:.0f} days lie between {plain(before.name)} and {plain(after.name)}, and one scene is made of both. If "
+        "these are two surveys, prepare each from a folder of its own into a target of its own."
+    ]
 
 
 def radiometry(
@@ -240,7 +258,11 @@ def pictures(target: Path, frames: Sequence[ThermalFrame], records: Sequence[Map
     quantiles = np.array([q for _, q in known])
     unit = "°C" if frames[0].calibration is not None else "grey"
     timed = "time_s" in known[0][0]
-    place = np.array([row["time_s"] for row, _ in known]) if timed else np.arange(len(known))
+    place, along = np.arange(len(known), dtype=float), "frame"
+    if timed:
+        place = np.array([row["time_s"] for row, _ in known])
+        length, unit_of_time = next((one for one in TIMES if np.ptp(place) >= 2 * one[0]), TIMES[-1])
+        place, along = place / length, f"{unit_of_time} since the first frame"
     edges = np.linspace(quantiles[:, 0].min(), max(quantiles[:, -1].max(), quantiles[:, 0].min() + 1e-6), BINS + 1)
     # A frame's share of pixels in each bin, from its distribution function, which its quantiles give.
     share = np.stack([np.diff(np.interp(edges, *_rising(q), left=0.0, right=1.0)) for q in quantiles])
@@ -279,7 +301,7 @@ def pictures(target: Path, frames: Sequence[ThermalFrame], records: Sequence[Map
         axes.fill_between(place, quantiles[:, low], quantiles[:, high], alpha=alpha, color="tab:red", linewidth=0)
     axes.plot(place, quantiles[:, MIDDLE], color="tab:red", marker=".", linewidth=1)
     axes.set(
-        xlabel="seconds since the first frame" if timed else "frame",
+        xlabel=along,
         ylabel=unit,
         title="Median of every frame, 5 .. 95 % of its pixels, and all of them",
     )
@@ -302,7 +324,9 @@ def _few_frames(frames: Sequence[ThermalFrame], quantiles: np.ndarray, unit: str
     few = [frames[i] for i in evenly_spread(len(frames), SHOWN)]
     columns = min(len(few), ACROSS)
     lines = -(-len(few) // columns)
-    figure = Figure(figsize=(9, 2.6 * lines if lines > 1 else 4.0), layout="constrained")
+    height, width = few[0].pixels().shape
+    across = 9.0 / columns if columns > 1 else 6.0
+    figure = Figure(figsize=(across * columns + 1.0, (across * height / width + 0.3) * lines), layout="compressed")
     places = np.atleast_1d(figure.subplots(lines, columns)).ravel()
     low, high = np.percentile(quantiles[:, 1], 5), np.percentile(quantiles[:, -2], 95)
     for place, frame in zip(places, few, strict=False):
@@ -310,7 +334,9 @@ def _few_frames(frames: Sequence[ThermalFrame], quantiles: np.ndarray, unit: str
         place.set_title(literal(frame.name), fontsize=7)
     for place in places:
         place.set_axis_off()
-    figure.colorbar(image, ax=list(places), label=unit, shrink=0.8)
+    figure.colorbar(
+        image, ax=list(places), label=unit, shrink=0.8, extend="both"
+    )  # the hottest and the coldest lie beyond
     return figure
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -65,8 +66,12 @@ class Writer:
             )
         ours = {frame.name for frame in frames}
         there = (p for p in sorted(self.images.glob("*")) if p.suffix.lower() in SUFFIXES)
-        if foreign := next((p for p in there if p.stem not in ours), None):
-            raise SceneError(f"{foreign} is no frame of this recording; give an empty folder as target, or remove it")
+        if foreign := [p.name for p in there if p.stem not in ours]:
+            raise SceneError(
+                f"{self.images} holds {len(foreign)} images that are no frames of this recording: {', '.join(foreign)}. If their "
+                f"files were taken out of the source, delete {self.images}, which is then written anew (rm -r "
+                f"{shlex.quote(str(self.images))}); else give an empty folder as target"
+            )
 
     def image_of(self, frame: ThermalFrame) -> Path:
         """Its file in the prepared folder."""

@@ -1,3 +1,6 @@
+from dataclasses import replace
+from datetime import timedelta
+
 import cv2
 import numpy as np
 import pytest
@@ -102,6 +105,23 @@ def test_doubts_and_recordings_without_a_temperature_are_findings(tmp_path):
     frames = read_frames(write_images(tmp_path / "files", {"a.tiff": np.full((8, 8), np.nan, np.float32)}))
     found = report.recording(frames, prepared(frames, tmp_path / "scene"), [], ["doubt"]).findings
     assert found[0] == "doubt" and "No pixel has a temperature" in found[1]
+
+
+@pytest.mark.parametrize(
+    ("step_s", "label", "found"), [(2.0, "seconds", 0), (50.0, "minutes", 0), (86400.0 * 30, "days", 1)]
+)
+def test_time_runs_in_a_unit_that_suits_it_and_surveys_days_apart_are_a_finding(
+    tmp_path, monkeypatch, step_s, label, found
+):
+    frames = read_frames(write_flir(tmp_path / "files"))
+    frames = [replace(f, time=frames[0].time + timedelta(seconds=i * step_s)) for i, f in enumerate(frames)]
+    records = prepared(frames, tmp_path / "scene")
+    pages = []
+    monkeypatch.setattr(report, "save_picture", lambda figure, path: pages.append(figure))
+    report.pictures(tmp_path / "scene", frames, records)
+    assert pages[-1].axes[0].get_xlabel() == f"{label} since the first frame"
+    findings = report.recording(frames, records, []).findings
+    assert len(findings) == found and all("30 days lie between" in finding for finding in findings)
 
 
 def test_findings_of_all_sections_stand_first_and_once(tmp_path):
