@@ -362,15 +362,12 @@ def study(config: dict[str, Any], output_dir: Path) -> None:
 @_job
 def prepare(config: dict[str, Any], output_dir: Path) -> None:
     """Makes a scene that trains of a camera's files, or corrects a trained scene pixel by pixel (correct=scene)."""
-    from heatsplat.preparation.conditions import GivenConditions
-
     if config["check"] is not None:
         _prepare_machine(config["threads"])
         build(config["examination"], target=None if config["target"] is None else output_dir)
         return
     if config["target"] is None or (config["source"] is None and config.get("correct") is None):
         raise SceneError("give the folder of the camera's files and that of the scene: source=FOLDER target=FOLDER")
-    GivenConditions(**config["conditions"])  # refused before the imports below, which take seconds
     _prepare_machine(config["threads"])
     try:
         build(config.get("correct") or config["preparation"], target=output_dir)
