@@ -37,7 +37,11 @@ def draw_cameras(path: Path, viewmats: Sequence[np.ndarray], points: np.ndarray,
     low, high = np.minimum(low, where.min(0)), np.maximum(high, where.max(0))
     length = SIGHT * float((high - low).max())
     kept = ((cloud >= low) & (cloud <= high)).all(1)
-    figure = Figure(figsize=(11, 5.5), layout="constrained")
+    wide, *others = high - low
+    tall = float(
+        np.clip(5.5 * max(others) / wide + 1.0, 3.5, 9.0)
+    )  # the panels fill the picture, whatever the scene's shape
+    figure = Figure(figsize=(12, tall), layout="compressed")
     for panel, (across, up, title) in zip(
         figure.subplots(1, 2), ((0, 1, "from above"), (0, 2, "from the side")), strict=True
     ):

@@ -20,6 +20,7 @@ UNITS = {
     "window_transmission": ("window_transmission", 1.0, 0.0),
     "window_c": ("window_k", 1.0, KELVIN_AT_0_C),
 }
+HOT_C = 100.0  # above it a temperature of the surroundings was rather given in kelvin
 # A setting that changes nothing while another one has this value.
 NEEDS = {
     "reflected_c": ("emissivity", 1.0),
@@ -64,6 +65,21 @@ class GivenConditions:
             for name, (condition, scale, offset) in UNITS.items()
             if (value := getattr(self, name)) is not None
         }
+
+    def doubts(self) -> list[str]:
+        """What can be and is hardly meant: temperatures that look like kelvin, a humidity that looks like a share."""
+        temperatures = {name: getattr(self, name) for name in UNITS if name.endswith("_c")}
+        found = [
+            f"conditions.{name}={value:g} is in °C; if it was meant in kelvin, give {value - KELVIN_AT_0_C:.4g}."
+            for name, value in temperatures.items()
+            if value is not None and value > HOT_C
+        ]
+        if self.humidity_percent is not None and 0 < self.humidity_percent < 1:
+            share = self.humidity_percent
+            found.append(
+                f"conditions.humidity_percent={share:g} is in per cent; if it was meant as a share, give {100 * share:g}."
+            )
+        return found
 
     def conditions(self, others: Conditions) -> Conditions:
         """These conditions, the rest from others."""

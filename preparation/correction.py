@@ -57,6 +57,7 @@ GRAZING = 0.17  # cosine of 80°: beyond, a smooth surface is an idea
 PERCENT = (1, 5, 50, 95, 99)
 ASSUMED = "Nothing says what air the scene was recorded in, so 20 °C and 50 % are assumed"
 TURNED, FEW_POINTS = 15.0, 30  # degrees by which views may disagree on normals (ours), and points that tell it
+NEARLY_ALL, MANY = 0.99, 0.1  # quantile of the points' depths, and share of pixels beyond it that is too many (ours)
 APART = (
     0.1  # by which distances of splats and of measured points may differ: the air changes as little with them (ours)
 )
@@ -184,7 +185,12 @@ def correct_scene(
     views = _by_name(scene)
     few = views.frames[:: max(1, len(views) // 8)]
     far = typical_distance(few, depth_of) * metres_per_unit
-    doubts = [_doubt(few, depth_of, scene.points), "" if index is None else _unsettled(few, depth_of, scene.points)]
+    doubts = [
+        _doubt(few, depth_of, scene.points),
+        _beyond(few, depth_of, scene.points),
+        "" if index is None else _unsettled(few, depth_of, scene.points),
+    ]
+    doubts += [doubt.rstrip(".") for doubt in given.doubts()]
     for doubt in filter(None, doubts):
         log.warning("%s", doubt)
 
@@ -363,6 +369,26 @@ def _doubt(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
     )
 
 
+def _beyond(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
+    """What to say where many pixels are farther than nearly any point that was measured in their image; empty where few are."""
+    beyond = []
+    for frame in few:
+        camera, depth = frame.camera, depth_of(frame)
+        _, within = _pixels(camera, points)
+        if within.any():
+            farthest = camera.project(points[within])[1].double().quantile(NEARLY_ALL)
+            known = depth[depth.isfinite()]
+            beyond.append((known > (1.0 + APART) * farthest).double())
+    share = float(torch.cat(beyond).mean()) if beyond else 0.0
+    if not share > MANY:
+        return ""
+    return (
+        f"{100 * share:.0f} % of the pixels lie farther than the points that the reconstruction measured in their images: where "
+        "surfaces have no texture distances are not settled; train longer (preset=fast, balanced), or look at the picture of "
+        "distances"
+    )
+
+
 def _unsettled(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
     """What to say where views disagree on the normals of the same points; empty where they do not."""
     seen = []
@@ -481,7 +507,6 @@ def _section(outcome: Outcome, far: float, index: float | None, doubts: Sequence
             "percentiles_c": dict(zip(map(str, PERCENT), quantiles.tolist(), strict=True)),
         }
     lines = [
-        *(line for doubt in doubts if doubt for line in (f"**{doubt}.**", "")),
         f"{len(outcome.cameras)} images, against one distance of {float(conditions.distance_m):.1f} m for all pixels (the "
         f"scene's median is {far:.1f} m) and an emissivity of {float(conditions.emissivity):g} at every angle. Air "
         f"{float(conditions.air_k) - KELVIN_AT_0_C:.1f} °C, {100 * float(conditions.humidity):.0f} %, reflected "
@@ -498,4 +523,6 @@ def _section(outcome: Outcome, far: float, index: float | None, doubts: Sequence
         "![distance, angle, temperature and change](report/correction.png)",
     ]
     angle = "" if index is None else " and an angle"
-    return Section(f"What a distance{angle} for each pixel changes", lines, values)
+    return Section(
+        f"What a distance{angle} for each pixel changes", lines, values, [f"{doubt}." for doubt in doubts if doubt]
+    )

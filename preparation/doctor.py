@@ -75,10 +75,11 @@ def section(folder: Path, reading: Reading | None = None) -> Section:
     if not posed:
         found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in found]
     warn(found)
-    lines = [f"- **{one.check}**: {one.what} {one.remedy}" for one in found] or ["Nothing found."]
+    lines = [f"{counted(len(found), 'finding')}, at the top of this page." if found else "Nothing found."]
     if _more_with_cameras(materials, found):
         lines += ["", LATER]
-    return Section("Doctor", lines, {"findings": [vars(one) for one in found]})
+    findings = [f"**{one.check}**: {one.what} {one.remedy}" for one in found]
+    return Section("Doctor", lines, {"findings": [vars(one) for one in found]}, findings)
 
 
 def _more_with_cameras(materials: Mapping[str, Material], found: Sequence[Finding]) -> bool:

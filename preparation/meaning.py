@@ -103,7 +103,11 @@ class Meaning:
             ), "counts, by the constants of counts.planck"
         if self.scale is not None:
             offset = -KELVIN_AT_0_C if self.offset_c is None else self.offset_c
-            return self.of_temperatures(self.scale, offset), f"counts: °C = {self.scale:g} * count {offset:+g}"
+            low, high = self.scale * np.percentile(sample, (1, 99)) + offset
+            return (
+                self.of_temperatures(self.scale, offset),
+                f"counts: °C = {self.scale:g} * count {offset:+g}, for {path.name} {low:.1f} .. {high:.1f} °C",
+            )
         low, median, high = np.percentile(sample, (1, 50, 99)) * CENTIKELVIN - KELVIN_AT_0_C
         if MEDIAN_C[0] < median < MEDIAN_C[1] and high - low < BULK_K:
             return (

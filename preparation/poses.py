@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
@@ -24,9 +23,11 @@ from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
 from heatsplat.datamodules.formats.lens import MODELS
 from heatsplat.io.files import write_atomically
+from heatsplat.physics.radiometry import Conditions
 from heatsplat.preparation.cameras_picture import draw_cameras
 from heatsplat.preparation.devices import Device, devices_of, listed
 from heatsplat.preparation.features import Features
+from heatsplat.preparation.fingerprint import fingerprint
 from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.report import Section, counted
 from heatsplat.preparation.rig import settle_rig, thermal_only
@@ -41,7 +42,7 @@ PICTURE = "report/cameras.png"
 SOURCES = ("thermal", "rgb")
 FEW_FEATURES = 60
 STILL_PX = 0.5  # median motion of the image between frames below which the camera stands still
-PAIRS_AT_ONCE = 200
+PAIRS_AT_ONCE = 20
 
 
 @dataclass(frozen=True)
@@ -153,12 +154,15 @@ class Search:
         images = self.work / "images"
         todo = [name for name in self.frames if not (images / self.copy_of[name]).is_file()]
         if todo:
-            stretches = [Stretch([f.pixels for f in device.frames], self.options.clip) for device in self.devices]
-            for name in _progress(todo, "stretching"):
+            stretches = [
+                Stretch([_apparent(frame).pixels for frame in device.frames], self.options.clip)
+                for device in self.devices
+            ]
+            for name in _progress(todo, f"stretching {counted(len(todo), 'frame')}"):
                 stretch = stretches[self.device_of[self.frames[name].name]]
-                _write_png(images / self.copy_of[name], stretch(self.frames[name].pixels()))
+                _write_png(images / self.copy_of[name], stretch(_apparent(self.frames[name]).pixels()))
         if self.options.by == "rgb":
-            for name in _progress(list(self.frames), "copying photos"):
+            for name in _progress(list(self.frames), f"copying {counted(len(self.frames), 'photo')}"):
                 copy = images / self._photo(name)
                 if not copy.is_file():
                     _write_png(copy, to_grey(read_image(self.frames[name].rgb)))
@@ -176,7 +180,7 @@ class Search:
                     image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)
                 }
         todo = [name for name in names if name in missing]
-        for name in _progress(todo, "finding features"):
+        for name in _progress(todo, f"finding features in {counted(len(todo), 'image')}"):
             reader.existing_camera_id = self._camera_of(name)
             self.options.features.extract(self.database, self.work / "images", name, reader)
         if not todo:
@@ -237,6 +241,7 @@ class Search:
         folder = self.work / "models"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
+        log.info("placing cameras of %s", counted(len(self.frames), "frame"))
         with Progress(transient=True, disable=not get_console().is_terminal) as bar:
             task = bar.add_task("placing cameras", total=len(self.frames))
             models = pycolmap.incremental_mapping(
@@ -320,10 +325,13 @@ class Search:
         return Section("Poses", lines, values)
 
     def _made_of(self) -> str:
-        """What copies, features and matches depend on."""
-        stats = [(self.target / "images" / name).stat() for name in self.frames]
-        images = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in zip(self.frames, stats, strict=True)]
-        return hashlib.sha256(repr([self.options, images, *self.frames.values()]).encode()).hexdigest()
+        """What copies, features and matches depend on: the files as the camera wrote them, but not the conditions."""
+        frames = [_apparent(frame) for frame in self.frames.values()]
+        # A photo in the target is of the frame's own file.
+        photos = [frame.rgb for frame in frames if frame.rgb is not None and self.target not in frame.rgb.parents]
+        files = [*(frame.path for frame in frames), *photos]
+        stats = [(path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+        return fingerprint(self.options, frames, stats)
 
     def _rig(self, model: pycolmap.Reconstruction, written: pycolmap.Reconstruction) -> tuple[float, list[float]]:
         """By how many degrees the thermal camera is turned against the visible one (median over the frames), and where it
@@ -529,6 +537,11 @@ def put_whole(fresh: Path, folder: Path) -> None:
     fresh.rename(folder)
 
 
+def _apparent(frame: ThermalFrame) -> ThermalFrame:
+    """The frame as the camera saw it: where cameras stand does not depend on emissivity, air and window."""
+    return replace(frame, conditions=Conditions(), sources={})
+
+
 def _fix(frame: ThermalFrame) -> tuple[float, float, float] | None:
     """Latitude, longitude and altitude of a frame; where take-off is the better zero, above it."""
     at = frame.position
@@ -551,4 +564,8 @@ def _write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def _progress(items: Sequence[Any], what: str) -> Iterator[Any]:
-    return iter(track(items, what, transient=True, disable=not get_console().is_terminal)) if items else iter(())
+    """The items with a bar on a terminal, after a line in the log, which is all that a file shows of a long stage."""
+    if not items:
+        return iter(())
+    log.info("%s", what)
+    return iter(track(items, what, transient=True, disable=not get_console().is_terminal))

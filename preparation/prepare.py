@@ -105,11 +105,13 @@ def prepare(
     frames = [replace(f, rgb=writer.photo_of(f)) if writer.photo_of(f).exists() else f for f in frames]
     notes = [*found.notes, *([f"{dead} pixels of the detector are dead; masks/ leaves them out"] if dead else [])]
     parts = [
-        report.recording(frames, records, notes),
+        report.recording(frames, records, notes, given.doubts()),
         report.radiometry(frames, records, uncertain),
         report.pictures(target, frames, records),
     ]
     sections += [part for part in parts if part is not None]
+    for finding in (finding for part in parts if part is not None for finding in part.findings):
+        log.warning("%s", finding)
     if poses:
         sections += _cameras(poses, partial(doctor, target, reading) if doctor else None, frames, place, sections)
     page = report.write_report(target, sections)
@@ -137,5 +139,6 @@ def _cameras(
     finally:
         place.has_cameras()
     log.info("%s", found.lines[0])
+    sections = [found, replace(doctor(), title="Doctor, with the cameras")] if doctor else [found]
     log.info("it trains: python src/train.py data=colmap %s", typed(setting("data.root", target)))
-    return [found, replace(doctor(), title="Doctor, with the cameras")] if doctor else [found]
+    return sections

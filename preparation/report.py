@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from heatsplat.contracts import evenly_spread
+from heatsplat.datamodules.timestamps import instant
 from heatsplat.io.files import write_atomically
 from heatsplat.io.page import PAGE_FILE, plain, write_page
 from heatsplat.io.pictures import literal
 from heatsplat.io.tables import markdown_table
-from heatsplat.physics.radiometry import LIMITS, measured_signal, surface_temperature, uncertainty
+from heatsplat.physics.radiometry import LIMITS, Conditions, measured_signal, surface_temperature, uncertainty
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import InputUncertainty
 from heatsplat.preparation.devices import devices_of
@@ -29,6 +31,8 @@ from heatsplat.preparation.writer import QUANTILES, rows
 BINS = 160
 SHOWN, ACROSS = 6, 3  # frames that are shown, and how many of them in a row
 LOW, MIDDLE, HIGH = 2, len(QUANTILES) // 2, len(QUANTILES) - 3  # 5 %, 50 % and 95 % of the pixels
+DAY_S = 86400.0
+TIMES = ((DAY_S, "days"), (3600.0, "hours"), (60.0, "minutes"), (1.0, "seconds"))
 LABELS = {
     "emissivity": "emissivity",
     "reflected_k": "reflected temperature",
@@ -44,6 +48,9 @@ APPARENT = (
     "Apparent temperatures: emissivity is 1, and neither air nor window is corrected; files and settings say nothing else. "
     "`conditions.emissivity=0.95 conditions.reflected_c=5 conditions.distance_m=20` would."
 )
+LARGE_K = (
+    20.0  # by which conditions change the temperature of half of the pixels; under a clear sky metals have more (ours)
+)
 NEUTRAL = {"emissivity": 1.0, "distance_m": 0.0, "window_transmission": 1.0}
 
 
@@ -55,16 +62,20 @@ class Section:
         title: of the heading.
         lines: Markdown; pictures are linked by their names relative to the prepared folder.
         values: what a program may want to read of it, as plain JSON values.
+        findings: what is wrong or doubtful, a sentence or two each; they stand at the top of the page.
     """
 
     title: str
     lines: list[str]
     values: dict[str, object] = field(default_factory=dict)
+    findings: list[str] = field(default_factory=list)
 
 
 def write_report(target: Path, sections: Sequence[Section], made: str = PREPARED) -> Path:
-    """Writes report.md, and report.html with the pictures in it; returns the path of the first."""
+    """Writes report.md, and report.html with the pictures in it; returns the path of the first. All findings stand first."""
     lines = [f"# {plain(target.name)}, {made}", ""]
+    if findings := dict.fromkeys(finding for section in sections for finding in section.findings):
+        lines += ["## Findings", "", *(f"- {finding}" for finding in findings), ""]
     for section in sections:
         lines += [f"## {section.title}", "", *section.lines, ""]
     text = "\n".join(lines)
@@ -78,8 +89,14 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def recording(frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]], notes: Sequence[str]) -> Section:
-    """What was read."""
+def recording(
+    frames: Sequence[ThermalFrame],
+    records: Sequence[Mapping[str, Any]],
+    notes: Sequence[str],
+    doubts: Sequence[str] = (),
+) -> Section:
+    """What was read; ``doubts`` about the settings are its findings."""
+    findings = list(doubts)
     devices = devices_of(frames)
     lines = [f"- {counted(len(frames), 'frame')}, camera {devices[0].label}"]
     if len(devices) > 1:
@@ -94,6 +111,7 @@ def recording(frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any
         zones = "" if all(t.tzinfo for t in timed) else " (without a zone; zone=Europe/Berlin would say which)"
         ends = dict.fromkeys(time.isoformat() for time in (timed[0], timed[-1]))
         lines.append(f"- with a time: {len(timed)}, {' to '.join(ends)}{zones}")
+        findings += _days_apart([frame for frame in frames if frame.time is not None])
     lines.append(f"- with a GPS position: {sum(f.position is not None for f in frames)}")
     if photos := sum(r["photo"] is not None for r in records):
         lines.append(f"- with a photo of the same moment: {photos}")
@@ -104,15 +122,33 @@ def recording(frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any
         lines.append(
             f"- {min(q[0] for q in known):.2f} .. {max(q[-1] for q in known):.2f} °C" if known else "- no temperature"
         )
-    return Section("The recording", [*lines, *(f"- {note}" for note in notes)])
+        if not known:
+            findings.append("No pixel has a temperature under these settings: check `conditions` and `counts`.")
+    return Section("The recording", [*lines, *(f"- {note}" for note in notes)], findings=findings)
+
+
+def _days_apart(timed: Sequence[ThermalFrame]) -> list[str]:
+    """What to say where the longest pause between frames is one of days."""
+    ordered = sorted(timed, key=lambda frame: instant(frame.time))
+    pauses = [(instant(after.time) - instant(before.time), before, after) for before, after in pairwise(ordered)]
+    length, before, after = max(pauses, key=lambda pause: pause[0], default=(0.0, None, None))
+    if length < 2 * DAY_S:
+        return []
+    return [
+        f"{length / DAY_S:.0f} days lie between {plain(before.name)} and {plain(after.name)}, and one scene is made of both. If "
+        "these are two surveys, prepare each from a folder of its own into a target of its own."
+    ]
 
 
 def radiometry(
-    frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]], uncertain: InputUncertainty
+    frames: Sequence[ThermalFrame],
+    records: Sequence[Mapping[str, Any]],
+    uncertain: InputUncertainty,
 ) -> Section | None:
     """What each condition is, where it comes from, what it changes and what uncertainty it brings; None for greys.
 
-    At the temperatures that 5 %, half and 95 % of the pixels of the frame in the middle lie below.
+    At the temperatures that 5 %, half and 95 % of the pixels of the frame in the middle lie below. Its findings are
+    what a thermographer would ask about.
     """
     usable = [i for i, r in enumerate(records) if frames[i].calibration is not None and r["quantiles"]]
     if not usable:
@@ -166,7 +202,17 @@ def radiometry(
         *markdown_table(["input", "±", *(f"at {x:.1f} °C" for x in celsius.tolist())], unsure, "llrrr"),
     ]
     values = {"combined_c": parts["combined"].tolist(), "at_c": celsius.tolist()}
-    return Section("Radiometry", lines + _doubts(frames), values)
+    apparent_c, surface_c = (
+        float(surface_temperature(signal, response, Conditions())[1]) - KELVIN_AT_0_C,
+        float(celsius[1]),
+    )
+    findings = _doubts(frames)
+    if abs(surface_c - apparent_c) > LARGE_K:
+        findings.append(
+            f"The conditions turn an apparent {apparent_c:.1f} °C, the median of {plain(frame.name)}, into {surface_c:.1f} °C. "
+            "Check emissivity, reflected temperature and window under Radiometry."
+        )
+    return Section("Radiometry", lines, values, findings)
 
 
 def _is_corrected(frame: ThermalFrame) -> bool:
@@ -182,9 +228,14 @@ def _plus_minus(name: str, value: float) -> str:
 def _doubts(frames: Sequence[ThermalFrame]) -> list[str]:
     """What the files say and a thermographer would ask about."""
     found = []
-    if any(f.conditions.window_transmission < 1 and f.sources.get("window_transmission") == "file" for f in frames):
+    behind = [
+        f for f in frames if f.conditions.window_transmission < 1 and f.sources.get("window_transmission") == "file"
+    ]
+    if behind:
         found.append(
-            "The files say that a window was in front of the camera. If there was none, set conditions.window_transmission=1."
+            f"The files of {counted(len(behind), 'frame')}, such as {plain(behind[0].name)}, say that a window of "
+            f"{float(behind[0].conditions.window_transmission):g} was in front of the camera. If there was none, set "
+            "conditions.window_transmission=1."
         )
     for f in frames:
         high = f.position.above_takeoff_m if f.position else None
@@ -195,7 +246,7 @@ def _doubts(frames: Sequence[ThermalFrame]) -> list[str]:
                 f"conditions.distance_m={high:.0f} corrects the air."
             )
             break
-    return ["", *(f"**{text}**" for text in found)] if found else []
+    return found
 
 
 def pictures(target: Path, frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]]) -> Section:
@@ -207,7 +258,11 @@ def pictures(target: Path, frames: Sequence[ThermalFrame], records: Sequence[Map
     quantiles = np.array([q for _, q in known])
     unit = "°C" if frames[0].calibration is not None else "grey"
     timed = "time_s" in known[0][0]
-    place = np.array([row["time_s"] for row, _ in known]) if timed else np.arange(len(known))
+    place, along = np.arange(len(known), dtype=float), "frame"
+    if timed:
+        place = np.array([row["time_s"] for row, _ in known])
+        length, unit_of_time = next((one for one in TIMES if np.ptp(place) >= 2 * one[0]), TIMES[-1])
+        place, along = place / length, f"{unit_of_time} since the first frame"
     edges = np.linspace(quantiles[:, 0].min(), max(quantiles[:, -1].max(), quantiles[:, 0].min() + 1e-6), BINS + 1)
     # A frame's share of pixels in each bin, from its distribution function, which its quantiles give.
     share = np.stack([np.diff(np.interp(edges, *_rising(q), left=0.0, right=1.0)) for q in quantiles])
@@ -246,7 +301,7 @@ def pictures(target: Path, frames: Sequence[ThermalFrame], records: Sequence[Map
         axes.fill_between(place, quantiles[:, low], quantiles[:, high], alpha=alpha, color="tab:red", linewidth=0)
     axes.plot(place, quantiles[:, MIDDLE], color="tab:red", marker=".", linewidth=1)
     axes.set(
-        xlabel="seconds since the first frame" if timed else "frame",
+        xlabel=along,
         ylabel=unit,
         title="Median of every frame, 5 .. 95 % of its pixels, and all of them",
     )
@@ -269,7 +324,9 @@ def _few_frames(frames: Sequence[ThermalFrame], quantiles: np.ndarray, unit: str
     few = [frames[i] for i in evenly_spread(len(frames), SHOWN)]
     columns = min(len(few), ACROSS)
     lines = -(-len(few) // columns)
-    figure = Figure(figsize=(9, 2.6 * lines if lines > 1 else 4.0), layout="constrained")
+    height, width = few[0].pixels().shape
+    across = 9.0 / columns if columns > 1 else 6.0
+    figure = Figure(figsize=(across * columns + 1.0, (across * height / width + 0.3) * lines), layout="compressed")
     places = np.atleast_1d(figure.subplots(lines, columns)).ravel()
     low, high = np.percentile(quantiles[:, 1], 5), np.percentile(quantiles[:, -2], 95)
     for place, frame in zip(places, few, strict=False):
@@ -277,7 +334,9 @@ def _few_frames(frames: Sequence[ThermalFrame], quantiles: np.ndarray, unit: str
         place.set_title(literal(frame.name), fontsize=7)
     for place in places:
         place.set_axis_off()
-    figure.colorbar(image, ax=list(places), label=unit, shrink=0.8)
+    figure.colorbar(
+        image, ax=list(places), label=unit, shrink=0.8, extend="both"
+    )  # the hottest and the coldest lie beyond
     return figure
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.side_files import Table, read_table
+from heatsplat.io.tables import SPELLINGS
 from heatsplat.preparation.frame import Attitude, Position, ThermalFrame
 
 Row = tuple[int, list[str]]  # number of its line, and its cells
@@ -48,6 +49,12 @@ def with_table(
         changed.append(frame)
     table.check_use(rows.values(), used)
     notes.append(f"{path.name} tells {', '.join(sorted(used)) or 'nothing'} of {len(rows)} of {len(frames)} frames")
+    if unknown := [column for i, column in enumerate(table.table.columns) if column and i not in table.at.values()]:
+        free = next((key for key in SPELLINGS if key not in table.at), "time")
+        notes.append(
+            f"{path.name}: columns {', '.join(unknown)} are not used; table_columns says what one holds, as in "
+            f"table_columns.{free}={unknown[0]}"
+        )
     return changed
 
 
@@ -69,6 +76,7 @@ class FrameTable:
     def read(cls, path: Path, columns: Mapping[str, str]) -> FrameTable:
         """The table in a file. Raises SceneError where it has no names of files, or nothing else that is known."""
         table = read_table(path)
+        columns = {key: _there(key, column, table, path) for key, column in columns.items()}
         at = {key: table.columns.index(column) for key, column in columns.items() if column in table.columns}
         if "name" not in at:
             raise SceneError(
@@ -174,6 +182,20 @@ class FrameTable:
             raise SceneError(
                 f"{self.table.path}, line {line}: {cell!r} in column {self.columns[key]} is no number"
             ) from error
+
+
+def _there(key: str, column: str, table: Table, path: Path) -> str:
+    """The column of ``key`` in a table: the one that is named, or another usual name of it that the table has.
+
+    Raises:
+        SceneError: the table has no column of a name that is none of the usual ones.
+    """
+    usual = SPELLINGS[key]
+    if column not in table.columns and column not in usual:
+        raise SceneError(
+            f"table={path} has no column {column!r}, as table_columns.{key} says; it has {', '.join(table.columns)}"
+        )
+    return next((name for name in (column, *usual) if name in table.columns), column)
 
 
 def _needed(kind: type[Position | Attitude]) -> set[str]:

@@ -6,9 +6,9 @@ that was stopped goes on where it was, and one with another emissivity makes the
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
+import shlex
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -33,6 +33,7 @@ from heatsplat.physics.radiometry import LIMITS, Conditions, PlanckResponse, mea
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import InputUncertainty
 from heatsplat.preparation.devices import devices_of
+from heatsplat.preparation.fingerprint import fingerprint
 from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.target import PARTIAL
 
@@ -66,8 +67,12 @@ class Writer:
             )
         ours = {frame.name for frame in frames}
         there = (p for p in sorted(self.images.glob("*")) if p.suffix.lower() in SUFFIXES)
-        if foreign := next((p for p in there if p.stem not in ours), None):
-            raise SceneError(f"{foreign} is no frame of this recording; give an empty folder as target, or remove it")
+        if foreign := [p.name for p in there if p.stem not in ours]:
+            raise SceneError(
+                f"{self.images} holds {len(foreign)} images that are no frames of this recording: {', '.join(foreign)}. If their "
+                f"files were taken out of the source, delete {self.images}, which is then written anew (rm -r "
+                f"{shlex.quote(str(self.images))}); else give an empty folder as target"
+            )
 
     def image_of(self, frame: ThermalFrame) -> Path:
         """Its file in the prepared folder."""
@@ -110,9 +115,8 @@ class Writer:
 
     def _made_of(self, frame: ThermalFrame) -> str:
         file = frame.path.stat()
-        parts = [str(frame.path), frame.number, file.st_size, file.st_mtime_ns, self.keep_counts, repr(frame)]
         dead = np.flatnonzero(self.dead[frame.name]).tolist() if frame.name in self.dead else []
-        return hashlib.sha256(json.dumps([*parts, repr(self.uncertain), dead]).encode()).hexdigest()[:32]
+        return fingerprint(frame, file.st_size, file.st_mtime_ns, self.keep_counts, self.uncertain, dead)
 
     def _record(self, frame: ThermalFrame, pixels: np.ndarray) -> dict[str, Any]:
         finite = np.isfinite(pixels)

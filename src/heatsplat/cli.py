@@ -52,6 +52,8 @@ EXAMPLES = {
     "study": ("study=frontier study.runs=outputs",),
     "prepare": ("source=/data/flight target=/data/my_scene",),
 }
+# Commands that have few settings of their own among groups of others, and the files of groups that --help then lists.
+SETTINGS = {"prepare": ("poses/thermal", "correct/scene")}
 
 
 def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
@@ -88,7 +90,16 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
         all_of_it = ALL_OF_IT in os.environ
         os.environ[ALL_OF_IT] = "1"  # Hydra raises what it would print otherwise
         try:
-            return main()
+            if name in SETTINGS and not {"--help", "-h"}.isdisjoint(sys.argv[1:]):
+                print(_help(name, job.__doc__ or ""))
+                result = None
+            else:
+                result = main()
+            sys.stdout.flush()
+            return result
+        except BrokenPipeError:  # as of --help | head
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has no reader
+            sys.exit(128 + signal.SIGPIPE)
         except Exception as error:  # of Hydra, or of a job of a sweep, when all others have run
             told = None if all_of_it else explain(error, name, sys.argv[1:])
             if told is None:
@@ -99,6 +110,24 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
                 del os.environ[ALL_OF_IT]
 
     return command
+
+
+def _help(name: str, doc: str) -> str:
+    """The settings of a command as its files of configuration explain them, without what is internal."""
+    own, _, _ = (Path(CONF) / f"{name}.yaml").read_text(encoding="utf-8").partition("  # internal")
+    lines = [doc.partition("\n")[0], "", *_explained(own.rpartition("\n")[0])]
+    for file in SETTINGS[name]:
+        group, _, option = file.partition("/")
+        text = (Path(CONF) / f"{file}.yaml").read_text(encoding="utf-8")
+        lines += ["", f"{group}:  # with {group}={option}", *(f"  {line}" for line in _explained(text))]
+    return "\n".join(lines)
+
+
+def _explained(text: str) -> list[str]:
+    """The lines of a file of configuration that say something to a user: choices of groups stand as they are set."""
+    internal = ("defaults:", "_target_", "by:", "  - _self_", "  - override", "  - thermal")
+    shown = (line.removeprefix("  - ") for line in text.strip().splitlines() if not line.startswith(internal))
+    return [line for line in shown if ": ${" not in line or "#" in line]
 
 
 def _job(

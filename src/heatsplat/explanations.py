@@ -25,6 +25,8 @@ NO_PLACE |= dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), "nothing may
 NO_PLACE |= dict.fromkeys(
     (errno.EEXIST, errno.ENOTDIR), "a file is where a folder is to be: remove it, or give another folder"
 )
+# What a command takes where someone typed folders alone.
+FOLDERS = {"prepare": "source=FOLDER target=FOLDER"}
 
 
 def explain(error: Exception, command: str, arguments: Sequence[str]) -> str | None:
@@ -74,7 +76,10 @@ def _of_composing(error: Exception, command: str, arguments: Sequence[str]) -> s
         return f"{place[1]}: {cause} (HYDRA_FULL_ERROR=1 shows where)"
     if place and cause is not None and _raised_here(cause) and expected(cause) is None:
         return None
-    return "\n".join(filter(None, [str(error), str(cause or ""), _meant(error, command, arguments)]))
+    meant = _meant(error, command, arguments)
+    # Hydra offers to append a key that there is not, which nothing would read.
+    told = re.sub(r"\nTo append to your config use \S+", "", str(error)) if meant else str(error)
+    return "\n".join(filter(None, [told, str(cause or ""), meant]))
 
 
 def _raised_here(error: BaseException) -> bool:
@@ -93,6 +98,8 @@ def _of_settings(error: TypeError) -> bool:
 def _meant(error: Exception, command: str, arguments: Sequence[str]) -> str:
     """ "Did you mean ...?" for a group's option or a key that there is not, or how a value is written that Hydra cannot read;
     empty where nothing is like it."""
+    if isinstance(error, OverrideParseException) and "=" not in error.override:
+        return f"Every argument names what it sets: {FOLDERS.get(command, 'key=value')}"
     if isinstance(error, OverrideParseException):
         return _quoted(error.override)
     if ambiguous := re.match(r"Ambiguous value for argument '(.+)'\n", str(error)):
@@ -124,8 +131,11 @@ def _of_unknown_key(wrong: str, command: str, arguments: Sequence[str]) -> str:
         name: key for key in keys for above, _, name in [key.rpartition(".")] if above == parent and name[0] != "_"
     }
     near = [beside[name] for name in difflib.get_close_matches(leaf, beside, 3)]
+    if not near and parent in keys and not beside:
+        chosen = f" with {parent}={option}" if (option := as_dict(arguments).get(parent)) else ""
+        return f"{parent} has nothing to set{chosen}: leave {wrong} out"
     if not near and parent in keys:
-        return f"{parent} has {', '.join(sorted(beside)) or 'nothing to set'}"
+        return f"{parent} has {', '.join(sorted(beside))}"
     return _did_you_mean(near or difflib.get_close_matches(wrong, keys, 3))
 
 

@@ -39,6 +39,13 @@ def test_what_cannot_be_is_refused(wrong, said):
         GivenConditions(**wrong)
 
 
+def test_what_can_be_and_is_hardly_meant_is_doubted():
+    assert GivenConditions(reflected_c=-40.0, air_c=35.0, humidity_percent=1.0, window_c=100.0).doubts() == []
+    kelvin, share = GivenConditions(reflected_c=293, humidity_percent=0.5).doubts()
+    assert "conditions.reflected_c=293 is in °C" in kelvin and "give 19.85" in kelvin
+    assert "conditions.humidity_percent=0.5 is in per cent" in share and "give 50" in share
+
+
 def test_air_for_which_the_formula_has_no_answer_is_refused():
     with pytest.raises(SceneError, match="a.tiff: at 90000 m of air with 90 % humidity .*conditions.distance_m"):
         GivenConditions(distance_m=90_000, humidity_percent=90, air_c=30).settled(FRAME)

@@ -195,6 +195,21 @@ def test_splats_that_lie_elsewhere_than_the_points_are_doubted(tmp_path, share):
     assert ("lie 25 % farther than the points" in page.read_text()) == (share < 1)
 
 
+@pytest.mark.parametrize("far", [False, True])
+def test_pixels_beyond_all_measured_points_are_doubted(tmp_path, far):
+    there = DEPTH.isfinite()
+    limit = DEPTH[there].median() if far else DEPTH[there].max()
+    y, x = (there & (limit >= DEPTH)).nonzero().unbind(1)
+    points = (
+        torch.stack([(x + 0.5 - 20.0) / 38.0, (y + 0.5 - 16.0) / 38.0, torch.ones(len(x))], 1) * DEPTH[y, x][:, None]
+    )
+    shown = scene()
+    shown.points = points.float()
+    page = correct_scene(shown, lambda frame: DEPTH, [], tmp_path, GivenConditions(), BandResponse(), None, METRES)
+    assert ("% of the pixels lie farther than the points" in page.read_text()) == far
+    assert "nearer than the points" not in page.read_text()  # where points are, distances are right
+
+
 def test_cameras_that_are_turned_against_each_other_agree_on_the_normals_of_a_floor():
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     eyes = torch.tensor([[0.0, -8.0, 6.0], [2.0, 0.0, 9.0], [9.0, 6.0, 4.0]], dtype=torch.float64)

@@ -35,6 +35,7 @@ def test_kelvin_times_100_is_recognised_and_nothing_else_is_guessed():
 def test_what_is_said_goes_before_what_is_guessed():
     sample = np.full((2, 2), 20000, np.uint16)
     assert celsius(Meaning(scale=1 / 64).of_counts(sample, HERE)[0], [19200.0]) == pytest.approx([26.85])
+    assert "for image.png 39.4 .. 39.4 °C" in Meaning(scale=1 / 64).of_counts(sample, HERE)[1]
     assert celsius(Meaning(scale=0.1, offset_c=-50.0).of_counts(sample, HERE)[0], [700.0]) == pytest.approx([20.0])
     planck = Meaning(planck=[17945.85, 1435.0, 1.0, -2539, 0.0125])
     assert 5 < celsius(planck.of_counts(sample, HERE)[0], [11441.0])[0] < 20  # a FLIR ONE out of doors

@@ -15,6 +15,7 @@ from heatsplat.datamodules.formats.colmap import read_model
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, flight, write_camera
 from heatsplat.datamodules.synthetic_scene.film import Size
 from heatsplat.geometry.alignment import pose_errors
+from heatsplat.preparation.conditions import GivenConditions
 from heatsplat.preparation.features import Sift
 from heatsplat.preparation.frame import Position, ThermalFrame
 from heatsplat.preparation.frames import Reading, read_recording
@@ -26,11 +27,12 @@ def search_of(tmp_path: Path, frames: int, **options) -> Search:
     start, found = datetime(2024, 7, 1, tzinfo=UTC), []
     for i in range(frames):
         (tmp_path / "images" / f"f{i:03d}.tif").touch()
+        (tmp_path / f"f{i:03d}.tif").touch()
         place = Position(51.0 + 1e-4 * i, 4.0, 75.0)
         found.append(
             ThermalFrame(
                 f"f{i:03d}",
-                Path(f"f{i:03d}.tif"),
+                tmp_path / f"f{i:03d}.tif",
                 0,
                 lambda: np.zeros((4, 4), np.float32),
                 time=start + timedelta(seconds=i),
@@ -54,9 +56,10 @@ def test_a_search_goes_on_and_begins_anew_where_frames_or_settings_have_changed(
     search.begin()
     left = search.work / "database.db"
 
-    def stays(options: FindPoses) -> bool:
+    def stays(options: FindPoses, **conditions: float) -> bool:
         left.touch()
-        again = Search(options, list(search.frames.values()), tmp_path)
+        frames = [GivenConditions(**conditions).settled(frame) for frame in search.frames.values()]
+        again = Search(options, frames, tmp_path)
         again.begin()
         return left.is_file()
 
@@ -64,6 +67,8 @@ def test_a_search_goes_on_and_begins_anew_where_frames_or_settings_have_changed(
     assert not stays(FindPoses(Sift(most=99))) and stays(FindPoses(Sift(most=99)))
     assert not stays(FindPoses(Sift(most=99), clip=2.0)) and not stays(FindPoses(Sift()))
     (tmp_path / "images" / "f002.tif").write_bytes(b"corrected for another emissivity")
+    assert stays(FindPoses(Sift()), emissivity=0.9, reflected_c=-20.0)
+    (tmp_path / "f002.tif").write_bytes(b"another recording")
     assert not stays(FindPoses(Sift())) and stays(FindPoses(Sift()))
 
 

@@ -1,3 +1,6 @@
+from dataclasses import replace
+from datetime import timedelta
+
 import cv2
 import numpy as np
 import pytest
@@ -40,8 +43,18 @@ def test_doubtful_statements_of_files_are_asked_about(tmp_path):
     window = [GivenConditions(window_transmission=0.8).settled(f) for f in frames]
     of_file = [type(f)(**{**vars(f), "sources": {**f.sources, "window_transmission": "file"}}) for f in window]
     asked = "If there was none, set conditions.window_transmission=1"
-    assert asked in "\n".join(report.radiometry(of_file, records, InputUncertainty()).lines)
-    assert asked not in "\n".join(report.radiometry(window, records, InputUncertainty()).lines)
+    (finding,) = report.radiometry(of_file, records, InputUncertainty()).findings
+    assert asked in finding and f"4 frames, such as {of_file[0].name}, say that a window of 0.8" in finding
+    assert not report.radiometry(window, records, InputUncertainty()).findings
+
+
+def test_a_correction_that_is_larger_than_conditions_bring_is_a_finding(tmp_path):
+    frames = read_frames(write_flir(tmp_path / "files"))
+    for given, count in ((GivenConditions(emissivity=0.9, reflected_c=160.0), 1), (GivenConditions(emissivity=0.8), 0)):
+        settled = [given.settled(frame) for frame in frames]
+        records = prepared(settled, tmp_path / f"scene{count}")
+        findings = report.radiometry(settled, records, InputUncertainty()).findings
+        assert len(findings) == count and all("The conditions turn an apparent" in finding for finding in findings)
 
 
 def test_pictures_show_steps_that_all_pixels_share(tmp_path):
@@ -86,6 +99,36 @@ def test_names_are_shown_as_they_are(tmp_path):
 def test_the_page_has_its_sections_in_order(tmp_path):
     page = report.write_report(tmp_path / "scene", [report.Section("One", ["a"]), report.Section("Two", ["b"])])
     assert page.read_text().index("## One") < page.read_text().index("## Two")
+
+
+def test_doubts_and_recordings_without_a_temperature_are_findings(tmp_path):
+    frames = read_frames(write_images(tmp_path / "files", {"a.tiff": np.full((8, 8), np.nan, np.float32)}))
+    found = report.recording(frames, prepared(frames, tmp_path / "scene"), [], ["doubt"]).findings
+    assert found[0] == "doubt" and "No pixel has a temperature" in found[1]
+
+
+@pytest.mark.parametrize(
+    ("step_s", "label", "found"), [(2.0, "seconds", 0), (50.0, "minutes", 0), (86400.0 * 30, "days", 1)]
+)
+def test_time_runs_in_a_unit_that_suits_it_and_surveys_days_apart_are_a_finding(
+    tmp_path, monkeypatch, step_s, label, found
+):
+    frames = read_frames(write_flir(tmp_path / "files"))
+    frames = [replace(f, time=frames[0].time + timedelta(seconds=i * step_s)) for i, f in enumerate(frames)]
+    records = prepared(frames, tmp_path / "scene")
+    pages = []
+    monkeypatch.setattr(report, "save_picture", lambda figure, path: pages.append(figure))
+    report.pictures(tmp_path / "scene", frames, records)
+    assert pages[-1].axes[0].get_xlabel() == f"{label} since the first frame"
+    findings = report.recording(frames, records, []).findings
+    assert len(findings) == found and all("30 days lie between" in finding for finding in findings)
+
+
+def test_findings_of_all_sections_stand_first_and_once(tmp_path):
+    sections = [report.Section("One", ["a"]), report.Section("Two", ["b"], findings=["wrong"])]
+    text = report.write_report(tmp_path / "scene", [*sections, sections[1]]).read_text()
+    assert text.index("## Findings") < text.index("wrong") < text.index("## One") and text.count("wrong") == 1
+    assert "Findings" not in report.write_report(tmp_path / "scene", sections[:1]).read_text()
 
 
 def test_conditions_that_change_nothing_make_no_surface_temperatures(tmp_path):

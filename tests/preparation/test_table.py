@@ -29,11 +29,25 @@ def test_a_table_goes_before_the_files(tmp_path):
     frames = read_frames(tmp_path / "frames", Reading(table=table, columns=columns))
     assert [frame.name for frame in frames] == ["b", "a"]
     assert frames[1].position.latitude_deg == 50.5
-    with pytest.raises(SceneError, match="has no column 'image'"):
-        read_frames(tmp_path / "frames", Reading(table=table, columns=columns | {"name": "image"}))
+    with pytest.raises(SceneError, match="has no column 'picture'"):
+        read_frames(tmp_path / "frames", Reading(table=table, columns=columns | {"name": "picture"}))
+    with pytest.raises(SceneError, match="no column 'utc', as table_columns.time says; it has file, when, lat, lon"):
+        read_frames(tmp_path / "frames", Reading(table=table, columns=columns | {"time": "utc"}))
     table.write_text("file;when;lat;lon\na;yesterday;50,5;7,5\n")
     with pytest.raises(SceneError, match="line 2: 'yesterday' in column when is no date-time"):
         read_frames(tmp_path / "frames", Reading(table=table, columns=columns))
+
+
+def test_usual_names_of_columns_are_known_and_others_are_listed(tmp_path):
+    write_images(tmp_path / "frames", {"a.tiff": FLOATS})
+    table = tmp_path / "table.csv"
+    table.write_text("image,time,lat,gps_lon,h,note\na,2024-07-01T10:00:05Z,50.5,7.5,80,x\n")
+    columns = {"name": "file", "time": "time", "latitude_deg": "latitude", "longitude_deg": "longitude"}
+    columns["above_takeoff_m"] = "height"
+    found = read_recording(tmp_path / "frames", Reading(table=table, columns=columns))
+    assert (found.frames[0].position.latitude_deg, found.frames[0].position.longitude_deg) == (50.5, 7.5)
+    assert "table.csv tells latitude_deg, longitude_deg, time of 1 of 1 frames" in found.notes
+    assert any("columns h, note are not used" in note and "table_columns." in note for note in found.notes)
 
 
 def test_a_table_that_tells_nothing_is_refused_and_what_it_tells_is_said(tmp_path):

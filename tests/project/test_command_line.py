@@ -3,6 +3,8 @@
 import inspect
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -180,6 +182,34 @@ def test_bad_input_is_named_with_exit_code_one(overrides, message, tmp_path):
 def test_help_lists_the_choices(tmp_path):
     output = command("train", "method=etgs", "--help", cwd=tmp_path)
     assert "etgs" in output and "colmap" in output
+
+
+def test_help_of_preparation_lists_its_own_settings_with_their_units(tmp_path):
+    output = command("prepare", "--help", cwd=tmp_path)
+    assert "reflected_c: null          # apparent reflected temperature, °C" in output
+    assert (
+        "poses: thermal  # thermal | rgb | given | none" in output
+        and "camera_model: SIMPLE_RADIAL  # of COLMAP" in output
+    )
+    assert "refractive_index: null" in output and "internal" not in output and "etgs" not in output
+    shell = f"{sys.executable} {ROOT / 'src' / 'train.py'} --help | head -1"
+    ended = subprocess.run(shell, shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert "Traceback" not in ended.stderr and "BrokenPipe" not in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["/data/flight", "/data/scene"], "Every argument names what it sets: source=FOLDER target=FOLDER"),
+        (
+            ["poses=none", "poses.camera_model=RADIAL"],
+            "poses has nothing to set with poses=none: leave poses.camera_model out",
+        ),
+    ],
+)
+def test_what_preparation_cannot_take_is_told_with_the_remedy(arguments, meant, tmp_path):
+    output = command("prepare", *arguments, cwd=tmp_path, code=1)
+    assert meant in output and "Traceback" not in output and "To append" not in output
 
 
 def test_a_command_without_arguments_shows_how_it_is_used_and_trains_nothing(tmp_path):

@@ -68,6 +68,7 @@ class Material:
         clipped: share of pixels that lay outside the bounds, or None where unknown.
         answers: [F, k] how surfaces answer recorded weather in the frames of ``images``; None without a record.
         lenses: for every frame, the number of the camera that took it; empty where one took all.
+        without_camera: how many images of a model's folder have no camera in it, and how many images there are.
     """
 
     names: Sequence[str]
@@ -85,6 +86,7 @@ class Material:
     clipped: float | None = None
     answers: Tensor | None = None
     lenses: Sequence[int] = ()
+    without_camera: tuple[int, int] = (0, 0)
 
     @cached_property
     def chosen_times_s(self) -> Tensor | None:
@@ -207,12 +209,19 @@ def material_of(scene: SceneData) -> Material:
         clipped=scene.notes.get("clipped_fraction"),
         answers=drivers(scene.weather, seen_s, air=(QUICK_PER_S, SLOW_PER_S)),
         lenses=_lenses(frames),
+        without_camera=_without_camera(scene),
     )
 
 
 def _looked(position: int, view: View) -> tuple[int, Camera, Tensor | None]:
     """What is kept of a view beside its thermal image: its position, its camera and its photo."""
     return position, view.camera, None if view.rgb is None else coarse(view.rgb.mean(2))
+
+
+def _without_camera(scene: SceneData) -> tuple[int, int]:
+    """How many images have no camera, and how many images there are; as far as the loader noted them."""
+    lost = int(str(scene.notes.get("images_unregistered", "0")).split()[0])
+    return lost, lost + len(scene.train) + len(scene.test)
 
 
 def coarse(image: Tensor) -> Tensor:

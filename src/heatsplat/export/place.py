@@ -21,13 +21,12 @@ from heatsplat.export.moment import Moment
 from heatsplat.geometry.alignment import Similarity, similarity_between
 from heatsplat.geometry.rotations import matrices_to_quats, quats_to_matrices
 from heatsplat.geometry.trajectories import upward
+from heatsplat.io.tables import SPELLINGS
 
 log = logging.getLogger("heatsplat")
 
 # Columns of a table of positions, as preparation writes them and as others do.
-NAMES = ("file", "name", "image")
-LATITUDES = ("latitude_deg", "latitude", "gps_lat", "lat")
-LONGITUDES = ("longitude_deg", "longitude", "gps_lon", "lon")
+NAMES, LATITUDES, LONGITUDES = (SPELLINGS[key] for key in ("name", "latitude_deg", "longitude_deg"))
 HEIGHTS = ("above_takeoff_m", "altitude_m", "altitude", "rel_alt", "alt")
 AUTO = "auto"
 LEAST_SPREAD = 0.1  # positions whose second extent is below this share of the first lie on a line

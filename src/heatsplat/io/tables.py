@@ -15,6 +15,19 @@ from heatsplat.io.files import write_atomically
 
 NONE = "–"
 
+# By what they hold, columns of tables of frames as people and programs call them.
+SPELLINGS = {
+    "name": ("file", "name", "image"),
+    "time": ("time",),
+    "latitude_deg": ("latitude_deg", "latitude", "gps_lat", "lat"),
+    "longitude_deg": ("longitude_deg", "longitude", "gps_lon", "lon"),
+    "altitude_m": ("altitude_m", "altitude", "gps_alt", "alt"),
+    "above_takeoff_m": ("above_takeoff_m", "height", "rel_alt"),
+    "yaw_deg": ("yaw_deg", "yaw"),
+    "pitch_deg": ("pitch_deg", "pitch"),
+    "roll_deg": ("roll_deg", "roll"),
+}
+
 
 def number(value: float | None, digits: int, spread: float | None = None) -> str:
     """A number with separated thousands and its spread if there is one; a dash for None and NaN."""

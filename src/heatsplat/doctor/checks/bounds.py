@@ -5,10 +5,12 @@ from __future__ import annotations
 import torch
 
 from heatsplat.doctor.base import Check, Finding, Material
+from heatsplat.physics.units import KELVIN_AT_0_C
 
 CLIPPED = 0.005  # share of pixels beyond the bounds
 NARROW = 0.15  # of the range that pixels use
 EARTHLY_C = (-60.0, 650.0)  # what cameras measure without a special range
+KELVIN_C = (200.0, 400.0)  # "°C" between which a whole scene is rather one of -73 .. 127 °C in kelvin
 PLATEAU = 0.004  # share of an image's pixels at exactly its largest value
 MIN_PLATEAU = 8  # pixels: one always is the largest, and in a small image it is a large share
 
@@ -23,6 +25,7 @@ def find(material: Material) -> list[Finding]:
     values = torch.cat(sampled)
     if not len(values):
         return []
+    found += _of_unit(material, values)
     if material.bounds_c is not None:
         low, high = material.bounds_c
         clipped = material.clipped
@@ -48,15 +51,6 @@ def find(material: Material) -> list[Finding]:
                     "Narrow the bounds to what the scene shows: losses and 8-bit greys spend the rest on nothing.",
                 )
             )
-        if low < EARTHLY_C[0] or high > EARTHLY_C[1]:
-            found.append(
-                Finding(
-                    "bounds",
-                    0.9,
-                    f"The images are said to show {low:g} .. {high:g} °C.",
-                    "Check the unit (°C, kelvin, counts) and data.raw_scale, data.raw_offset_c.",
-                )
-            )
     flat = [f for f, share in enumerate(plateaus) if share > PLATEAU]
     if len(flat) > 0.1 * len(material.images) and not any(
         one.check == "bounds" and "cut off" in one.what for one in found
@@ -72,6 +66,27 @@ def find(material: Material) -> list[Finding]:
             )
         )
     return found
+
+
+def _of_unit(material: Material, values: torch.Tensor) -> list[Finding]:
+    """Temperatures that are rather kelvin or counts, by the bounds of a scene, else by the pixels of a camera's files."""
+    if material.unit_k is None:
+        return []
+    low, high = material.bounds_c or (float(values.min()), float(values.max()))
+    remedy = (
+        "Check the unit (°C, kelvin, counts): counts.scale and counts.offset_c of a camera's files, or data.raw_scale and "
+        "data.raw_offset_c."
+    )
+    if KELVIN_C[0] <= low and high <= KELVIN_C[1]:
+        what = f"All pixels lie within {low:.4g} .. {high:.4g} °C, which may be kelvin of"
+        what = f"{what} {low - KELVIN_AT_0_C:.4g} .. {high - KELVIN_AT_0_C:.4g} °C."
+        return [Finding("bounds", 0.9, what, remedy)]
+    if material.bounds_c is None:  # a cold sky or a flame may be in view, but no scene consists of them
+        low, high = float(values.median()), float(values.median())
+    if low < EARTHLY_C[0] or high > EARTHLY_C[1]:
+        shown = f"{low:g} .. {high:g} °C" if low < high else f"{low:.4g} °C (median)"
+        return [Finding("bounds", 0.9, f"The images are said to show {shown}.", remedy)]
+    return []
 
 
 def _plateau(values: torch.Tensor) -> float:
