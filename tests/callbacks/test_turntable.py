@@ -33,4 +33,4 @@ def test_what_is_hotter_than_the_bar_is_told(tmp_path, monkeypatch):
     Turntable(frames=1, size=48).on_test_epoch_end(None, module)
     panel, title = shown[0]
     assert panel.bar.above and not panel.bar.below
-    assert panel.title.startswith("100 % above 4") and title == "5.0 min"
+    assert panel.title.startswith("100 % above 4") and title == "240.0 s"
