@@ -90,13 +90,12 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
         all_of_it = ALL_OF_IT in os.environ
         os.environ[ALL_OF_IT] = "1"  # Hydra raises what it would print otherwise
         try:
-            if name in SETTINGS and not {"--help", "-h"}.isdisjoint(sys.argv[1:]):
-                print(_help(name, job.__doc__ or ""))
-                result = None
-            else:
-                result = main()
-            sys.stdout.flush()
-            return result
+            try:
+                if name in SETTINGS and not {"--help", "-h"}.isdisjoint(sys.argv[1:]):
+                    return print(_help(name, job.__doc__ or ""))
+                return main()
+            finally:
+                sys.stdout.flush()  # here, where a reader that has gone is no error, not when Python ends
         except BrokenPipeError:  # as of --help | head
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has no reader
             sys.exit(128 + signal.SIGPIPE)

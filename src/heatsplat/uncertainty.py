@@ -456,12 +456,11 @@ def _across_gap(scene: SceneData, time_s: float) -> tuple[list[float], float]:
     start, span = scene.record
     before = min((time_s - taken_s for taken_s in scene.train.times_s if taken_s <= time_s), default=math.inf)
     after = min((taken_s - time_s for taken_s in scene.train.times_s if taken_s >= time_s), default=math.inf)
-    near = min(before, after)
+    near, far = sorted((before, after))
     if near <= GAP * span / len(scene.train):
         return [], 1.0
-    return [min(max(time_s + step, start), start + span) for step in (near, -near)], 1.0 / (
-        1.0 + near / max(before, after)
-    )
+    moments = [min(max(time_s + step, start), start + span) for step in (near, -near)]
+    return moments, 1.0 / (1.0 + near / far)
 
 
 def _only(rows: Tensor, stretch: int) -> Tensor:
