@@ -125,10 +125,9 @@ def rasterization(
         raise ValueError(f"features must have shape [{n}, C], got {list(features.shape)}")
     if tuple(viewmats.shape) != (4, 4) or tuple(Ks.shape) != (3, 3):
         raise ValueError(f"viewmats and Ks must be [4, 4] and [3, 3], got {list(viewmats.shape)} and {list(Ks.shape)}")
-    if Ks.device.type == "cpu" and float(Ks[0, 1]):  # elsewhere a look at it would wait for the device
-        raise ValueError(
-            f"Ks has a skew of {float(Ks[0, 1]):.6g} (its [0, 1]), which no renderer has: undistort images to 0"
-        )
+    # On a GPU a look at it would wait for the device.
+    if Ks.device.type == "cpu" and (skew := float(Ks.detach()[0, 1])):
+        raise ValueError(f"Ks has a skew of {skew:.6g} (its [0, 1]), which no renderer has: undistort images to 0")
     if signs is not None and tuple(signs.shape) != (n,):
         raise ValueError(f"signs must have shape [{n}], got {list(signs.shape)}")
     if opacities.shape[0] > 1 and modality_channels is None:
