@@ -21,14 +21,14 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from heatsplat.composition import compose
-from heatsplat.contracts import SceneError, check_numbers
+from heatsplat.contracts import SceneError, check_count, check_numbers
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, RunResults
 from heatsplat.io.tables import NONE, markdown_table, number, read_csv
 from heatsplat.runs.curves import Curve, Point, curves_of, merged, read_points, write_points
 from heatsplat.studies.child_runs import all_rows, train_or_read
-from heatsplat.studies.options import check_count, listed, non_empty, whole_numbers
+from heatsplat.studies.options import listed, non_empty, whole_numbers
 
 TABLE_FILE, PICTURE_FILE, POINTS_FILE = "budget.md", "budget.png", "budget_curves.csv"
 

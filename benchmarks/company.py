@@ -10,11 +10,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_count
 from heatsplat.io.command_lines import setting
 from heatsplat.io.files import write_atomically
 from heatsplat.io.tables import markdown_table
-from heatsplat.studies.options import check_count
 
 TABLE_FILE = "company.md"
 

@@ -110,10 +110,8 @@ def run(
     """
     check_option("study.clock", clock, CLOCKS, SceneError)
     chosen = non_empty("study.presets", list(presets)) if only is None else subset_of("study.only", only, presets)
-    selections, seeds = (
-        subset_of("study.selections", selections, SELECTIONS),
-        whole_numbers("study.seeds", seeds, least=0),
-    )
+    selections = subset_of("study.selections", selections, SELECTIONS)
+    seeds = whole_numbers("study.seeds", seeds, least=0)
     folder = Path(output_dir).resolve()
     common = [*([f"threads={threads}"] if threads else []), *listed(overrides)]
     known: dict[tuple[str, int, frozenset[str]], RunResults] = {}  # by preset, seed and effects that are on

@@ -19,14 +19,14 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from benchmarks.strengths import strengths
-from heatsplat.contracts import SceneData, SceneError
+from heatsplat.contracts import SceneData, SceneError, check_count
 from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import CATALOGUE, decide
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.tables import markdown_table
 from heatsplat.studies.child_runs import refuse_others
-from heatsplat.studies.options import check_count, listed, non_empty
+from heatsplat.studies.options import listed, non_empty
 from heatsplat.training.machine import cores, prepare_machine
 
 log = logging.getLogger("heatsplat")
@@ -248,9 +248,8 @@ def run(
     Raises:
         SceneError: there is no size, or nothing to decide on, or a verdict is of other settings of the data.
     """
-    whole = (
-        scenes is None and bool(listed(seeds) and listed(unseen)) and any(count for _, count in (drawn or {}).values())
-    )
+    any_drawn = any(count for _, count in (drawn or {}).values())
+    whole = scenes is None and bool(listed(seeds) and listed(unseen)) and any_drawn
     scenes = SCENES if scenes is None else scenes
     if jobs is not None:
         check_count("study.jobs", jobs)
@@ -268,9 +267,8 @@ def run(
     for path in (known[case] for case in cases if case not in waiting):
         refuse_others(path, json.loads(path.read_text(encoding="utf-8")).get("settings", ()), settings)
     for done, outcome in enumerate(_outcomes(data, waiting, cores() if jobs is None else jobs), start=1):
-        write_atomically(
-            known[outcome.scene, outcome.size, outcome.seed], json.dumps(_plain(outcome, settings), indent=1)
-        )
+        path = known[outcome.scene, outcome.size, outcome.seed]
+        write_atomically(path, json.dumps(_plain(outcome, settings), indent=1))
         log.info("%d of %d: %s %s %d", done, len(waiting), outcome.scene, outcome.size, outcome.seed)
         for name in sorted(outcome.missed | outcome.taken):
             log.info("    %s is %s", name, "missed" if name in outcome.present else "not there")

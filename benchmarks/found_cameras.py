@@ -15,7 +15,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ from heatsplat.geometry.alignment import PoseErrors, pose_errors
 from heatsplat.io.command_lines import setting
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import RunResults
-from heatsplat.io.tables import markdown_table, number
+from heatsplat.io.tables import markdown_table, number, over_seeds
 from heatsplat.studies.child_runs import refuse_others, train_or_read
 from heatsplat.studies.options import listed, non_empty, whole_numbers
 
@@ -223,12 +223,9 @@ def _row(name: str, frames: int, errors: PoseErrors, spent: Mapping[str, float])
 
 
 def _scores(runs: Sequence[RunResults]) -> list[str]:
-    def told(values: list[float], digits: int, spread: bool = False) -> str:
-        return number(fmean(values), digits, stdev(values) if spread and len(values) > 1 else None)
-
     return [
-        told([run.test["psnr"] for run in runs], 1, spread=True),
-        told([run.test["mae_c"] for run in runs], 3, spread=True),
-        told([run.cost["gaussians"] for run in runs], 0),
-        told([run.cost["cpu_seconds"] for run in runs], 0),
+        over_seeds([run.test["psnr"] for run in runs], 1),
+        over_seeds([run.test["mae_c"] for run in runs], 3),
+        number(fmean(run.cost["gaussians"] for run in runs), 0),
+        number(fmean(run.cost["cpu_seconds"] for run in runs), 0),
     ]

@@ -22,8 +22,9 @@ from pathlib import Path
 
 import yaml
 
+from heatsplat.contracts import check_count
 from heatsplat.io.tables import markdown_table
-from heatsplat.studies.options import check_count, subset_of
+from heatsplat.studies.options import subset_of
 
 log = logging.getLogger("heatsplat")
 

@@ -24,7 +24,7 @@ from heatsplat.geometry.transforms import camera_entry
 log = logging.getLogger("heatsplat")
 
 SCENES, TRUTH = "scenes", "truth"  # the two folders: what is handed out, and what is not
-UNTOLD = {"scene_seed": 0}  # of folders of before it was told
+EARLIER = {"scene_seed": 0}  # what meta.json does not say in folders of earlier versions
 META = "meta.json"
 
 
@@ -50,25 +50,24 @@ def write_scenes(
         SceneError: there is no such scene, or the folder holds scenes of another size, seed or other options.
     """
     target = Path(target or output_dir).expanduser()
-    told = {
+    settings = {
         name: {"size": size or protocol["size"], "scene_seed": protocol["scene_seed"]}
         | {"options": {**entry["data"], "parts": {**protocol["parts"], **entry.get("parts", {})}}}
         for name, entry in protocol["scenes"].items()
     }
     known = {
-        name: partial(Synthetic, split="parts", size=own["size"], scene_seed=own["scene_seed"], **own["options"])
-        for name, own in told.items()
+        name: partial(Synthetic, split="parts", size=made["size"], scene_seed=made["scene_seed"], **made["options"])
+        for name, made in settings.items()
     }
     known |= {name: partial(lambda module: module, module) for name, module in (real or {}).items()}
     if unknown := set(scenes or ()) - set(known):
         raise SceneError(f"study.scenes: there is no {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     for name in scenes or known:
-        made_from = {"protocol": protocol["version"], **({"size": None} if name in (real or {}) else told[name])}
+        made_from = {"protocol": protocol["version"], **({"size": None} if name in (real or {}) else settings[name])}
         meta = target / SCENES / name / META
         if meta.exists():
-            there = json.loads(meta.read_text())
-            before = {key: there.get(key, UNTOLD.get(key, value)) for key, value in made_from.items()}
-            if changed := [key for key, value in made_from.items() if before[key] != value]:
+            before = EARLIER | json.loads(meta.read_text())
+            if changed := [key for key, value in made_from.items() if before.get(key, value) != value]:
                 raise SceneError(
                     f"{meta.parent} was written with another {' and '.join(changed)}: delete it, or give study.target another "
                     "folder"

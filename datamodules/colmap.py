@@ -49,16 +49,12 @@ def _uncertainty(image: Path) -> float | None:
     return value if isinstance(value, float) else None
 
 
-def _world(folder: Path) -> dict[str, Any]:
-    """What the world file of a prepared folder holds; nothing without one."""
+def _world(folder: Path) -> tuple[float | None, str | None]:
+    """Metres of one unit of a prepared folder's world, and its axes in words; None where that is not known."""
     path = folder / WORLD_FILE
-    return json_object(path) if path.is_file() else {}
-
-
-def _scale(folder: Path) -> float | None:
-    """Metres of one unit of a prepared folder's world; None where that is not known."""
-    value = _world(folder).get("metres_per_unit")
-    return None if value is None else finite(value, f"{folder / WORLD_FILE}: 'metres_per_unit'")
+    world = json_object(path) if path.is_file() else {}
+    scale, axes = world.get("metres_per_unit"), world.get("axes")
+    return None if scale is None else finite(scale, f"{path}: 'metres_per_unit'"), axes and str(axes)
 
 
 class Colmap(SceneDataModule):
@@ -138,8 +134,9 @@ class Colmap(SceneDataModule):
         notes["encoding"] = encoding
         times, notes["time_source"] = self._times(folder, kept)
         bounds, bounds_source = self._bounds(folder)
-        if "axes" in (world := _world(folder)):
-            notes["axes"] = str(world["axes"])
+        metres_per_unit, axes = _world(folder)
+        if axes:
+            notes["axes"] = axes
         if (uncertainty := _uncertainty(index.folder / files[kept[0]])) is not None:
             notes["prepared_uncertainty_c"] = round(uncertainty, 2)
         if bounds:
@@ -169,7 +166,7 @@ class Colmap(SceneDataModule):
             thermal_range=bounds,
             counts=counts,
             ambient_c=self.ambient_c,
-            metres_per_unit=_scale(folder) if self.metres_per_unit is None else self.metres_per_unit,
+            metres_per_unit=metres_per_unit if self.metres_per_unit is None else self.metres_per_unit,
             notes=notes,
         )
         return replace(scene, positions=_positions(folder))

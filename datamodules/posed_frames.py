@@ -16,6 +16,7 @@ from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
 from heatsplat.datamodules.points import obj_vertices, random_points, told_random
 
+# Lists of frames by subset, in NTR's layout.
 FILES = {"train": "transforms_train.json", "test": "transforms_test.json"}
 
 
@@ -118,12 +119,12 @@ def listed_frames(
                 continue
             read = partial(read_image, folder / file)
             # Some frames carry their own field of view; the file's holds for the others.
-            own = {"camera_angle_x": frame["FovX"]} if "FovX" in frame else {}
+            fov = {"camera_angle_x": frame["FovX"]} if "FovX" in frame else {}
             frames.append(
                 RawFrame(
                     name=file,
                     viewmat=viewmat_of(transforms, frame, opengl=False),
-                    lens=lens_in(transforms, {**frame, **own}, lambda read=read: read().shape[1::-1]),
+                    lens=lens_in(transforms, {**frame, **fov}, lambda read=read: read().shape[1::-1]),
                     read=read,
                     read_mask=module.mask_reader(masks, file),
                     **{"subset": subset, **describe(frame, file)},

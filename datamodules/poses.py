@@ -23,7 +23,7 @@ def checked_pose(pose: Any, where: str) -> np.ndarray:
             scaled or mirrored, or its last row is not 0 0 0 1. ``where`` is named.
     """
     try:
-        matrix = np.asarray(pose, dtype=np.float64).copy()
+        matrix = np.asarray(pose, dtype=np.float64).copy()  # np.array warns of tensors
     except (TypeError, ValueError, OverflowError) as error:
         raise SceneError(f"{where} is no pose: a matrix of 4x4 numbers is needed") from error
     if matrix.shape == (3, 4):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,8 @@ import torch
 
 from heatsplat.contracts import SceneData, SceneError, View, ViewSet, check_option
 from heatsplat.datamodules.base import SceneDataModule
+from heatsplat.datamodules.formats.colmap import find_model
+from heatsplat.datamodules.nerfstudio import find_transforms
 from heatsplat.datamodules.raw_scene import RawFrame
 from heatsplat.datamodules.synthetic_scene.drawn import DRAWN, Drawn, drawn
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film, misplaced, own_threads
@@ -26,12 +28,12 @@ from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.geometry.resampling import resampled
 from heatsplat.physics.units import DAY_S
 
-LAYOUTS = {  # what marks a scene of another data set
-    "rhd": "thermal/sparse/0",
-    "colmap": "sparse/0",
-    "thermoscenes": "transforms_thermal.json",
-    "nerfstudio": "transforms.json",
-    "benchmark": "scenes/*/meta.json",
+LAYOUTS: dict[str, Callable[[Path], Path | None]] = {  # what in a folder marks scenes of another data set, if anything
+    "rhd": lambda folder: find_model(folder / "thermal"),
+    "colmap": find_model,
+    "thermoscenes": lambda folder: next(folder.glob("transforms_thermal.json"), None),
+    "nerfstudio": lambda folder: next(iter(find_transforms(folder)), None),
+    "benchmark": lambda folder: next(folder.glob("scenes/*/meta.json"), None),
 }
 STORED = {8: np.uint8, 16: np.uint16}  # integer type of images by their bits
 
@@ -219,9 +221,9 @@ def _meant(folder: Path) -> str:
     if not folder.is_dir():
         return "there is no such folder; leave data.root out for a made-up scene"
     places = (folder, *(place for place in sorted(folder.iterdir()) if place.is_dir()))
-    for name, mark in LAYOUTS.items():
-        if found := next((path for place in places for path in place.glob(mark)), None):
-            return f"did you mean data={name}? The folder has {found.relative_to(folder)}"
+    for name, mark_in in LAYOUTS.items():
+        if mark := next(filter(None, map(mark_in, places)), None):
+            return f"did you mean data={name}? The folder has {mark.relative_to(folder)}"
     return (
         f"say with data=... what the folder holds ({', '.join(LAYOUTS)}, ...), make a scene of a camera's files by "
         "prepare.py, or leave data.root out for a made-up scene"

@@ -107,7 +107,18 @@ TIME_NAMES = ("time", "utc", "time_utc", "timestamp", "timestamp_utc", "datetime
 
 
 def read_columns(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, Any]]:
-    """Times [T] and columns [T] (NaN where missing) of a table in our units, unsorted, and notes."""
+    """Times [T], columns [T] by name (NaN where missing) and notes of a table, unsorted.
+
+    Times are float64 seconds, since 1970 UTC where they are dates, else on the clock of the table; columns have the units of
+    ``QUANTITIES``.
+
+    Args:
+        path: of the table.
+        zone: of its times where they have no offset (``utc_seconds``).
+
+    Raises:
+        SceneError: there is no such table, it has no times or none of the quantities, or a cell cannot be read.
+    """
     if not path.is_file():
         raise SceneError(f"there is no weather table {path}")
     table = read_table(path)

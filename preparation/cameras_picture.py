@@ -38,9 +38,8 @@ def draw_cameras(path: Path, viewmats: Sequence[np.ndarray], points: np.ndarray,
     length = SIGHT * float((high - low).max())
     kept = ((cloud >= low) & (cloud <= high)).all(1)
     wide, *others = high - low
-    tall = float(
-        np.clip(5.5 * max(others) / wide + 1.0, 3.5, 9.0)
-    )  # the panels fill the picture, whatever the scene's shape
+    # The panels fill the picture, whatever the scene's shape.
+    tall = float(np.clip(5.5 * max(others) / wide + 1.0, 3.5, 9.0))
     figure = Figure(figsize=(12, tall), layout="compressed")
     for panel, (across, up, title) in zip(
         figure.subplots(1, 2), ((0, 1, "from above"), (0, 2, "from the side")), strict=True

@@ -20,7 +20,7 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, ViewSet, check_numbers
+from heatsplat.contracts import Camera, SceneData, SceneError, View, ViewSet, check_numbers
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import write_model
@@ -58,9 +58,8 @@ PERCENT = (1, 5, 50, 95, 99)
 ASSUMED = "Nothing says what air the scene was recorded in, so 20 °C and 50 % are assumed"
 TURNED, FEW_POINTS = 15.0, 30  # degrees by which views may disagree on normals (ours), and points that tell it
 NEARLY_ALL, MANY = 0.99, 0.1  # quantile of the points' depths, and share of pixels beyond it that is too many (ours)
-APART = (
-    0.1  # by which distances of splats and of measured points may differ: the air changes as little with them (ours)
-)
+# Share by which distances of splats and of measured points may differ: the air changes as little with them (ours).
+APART = 0.1
 
 
 @dataclass(frozen=True)
@@ -183,15 +182,12 @@ def correct_scene(
     place = Target(target, CORRECTED)
     place.claim()
     views = _by_name(scene)
-    few = views.frames[:: max(1, len(views) // 8)]
-    far = typical_distance(few, depth_of) * metres_per_unit
-    doubts = [
-        _doubt(few, depth_of, scene.points),
-        _beyond(few, depth_of, scene.points),
-        "" if index is None else _unsettled(few, depth_of, scene.points),
-    ]
-    doubts += [doubt.rstrip(".") for doubt in given.doubts()]
-    for doubt in filter(None, doubts):
+    few = [(frame.camera, depth_of(frame)) for frame in views.frames[:: max(1, len(views) // 8)]]
+    far = typical_distance(few) * metres_per_unit
+    doubts = [_doubt(few, scene.points), _beyond(few, scene.points)]
+    doubts += [] if index is None else [_unsettled(few, scene.points)]
+    doubts = [doubt for doubt in (*doubts, *given.doubts()) if doubt]
+    for doubt in doubts:
         log.warning("%s", doubt)
 
     outcome, recorded = Outcome(), _recorded(folders)
@@ -229,7 +225,7 @@ def correct_scene(
     write_bounds(target, outcome.low, outcome.high)
     write_png(target / "report" / "correction.png", _picture(outcome.shown))
     if outcome.air_assumed:
-        doubts.append(f"{ASSUMED}: give conditions.air_c and conditions.humidity_percent")
+        doubts.append(f"{ASSUMED}: give conditions.air_c and conditions.humidity_percent.")
         log.warning("%s", doubts[-1])
     page = write_report(
         target, [_section(outcome, far, index, doubts)], f"{CORRECTED} by the trained scene {scene.name}"
@@ -350,11 +346,10 @@ def _by_name(scene: SceneData) -> ViewSet:
     return ViewSet([part.frames[k] for part, k in places], lambda i: places[i][0][places[i][1]])
 
 
-def _doubt(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
-    """What to say where the splats lie elsewhere than the points that the reconstruction measured; empty where they do not."""
+def _doubt(few: Sequence[tuple[Camera, Tensor]], points: Tensor) -> str:
+    """What to say of a few cameras and their depths [H, W] where the splats lie elsewhere than the points that were measured."""
     found = []
-    for frame in few:
-        camera, depth = frame.camera, depth_of(frame)
+    for camera, depth in few:
         at, within = _pixels(camera, points)
         far = camera.project(points[within])[1]
         found.append(depth[at[:, 1], at[:, 0]] / far)
@@ -365,15 +360,14 @@ def _doubt(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
         return ""
     return (
         f"The trained surfaces lie {100 * abs(off):.0f} % {'farther' if off > 0 else 'nearer'} than the points that the "
-        "reconstruction measured (median): distances are not settled; train longer (preset=fast, balanced)"
+        "reconstruction measured (median): distances are not settled; train longer (preset=fast, balanced)."
     )
 
 
-def _beyond(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
+def _beyond(few: Sequence[tuple[Camera, Tensor]], points: Tensor) -> str:
     """What to say where many pixels are farther than nearly any point that was measured in their image; empty where few are."""
     beyond = []
-    for frame in few:
-        camera, depth = frame.camera, depth_of(frame)
+    for camera, depth in few:
         _, within = _pixels(camera, points)
         if within.any():
             farthest = camera.project(points[within])[1].double().quantile(NEARLY_ALL)
@@ -385,16 +379,15 @@ def _beyond(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
     return (
         f"{100 * share:.0f} % of the pixels lie farther than the points that the reconstruction measured in their images: where "
         "surfaces have no texture distances are not settled; train longer (preset=fast, balanced), or look at the picture of "
-        "distances"
+        "distances."
     )
 
 
-def _unsettled(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
+def _unsettled(few: Sequence[tuple[Camera, Tensor]], points: Tensor) -> str:
     """What to say where views disagree on the normals of the same points; empty where they do not."""
     seen = []
-    for frame in few:
-        camera = frame.camera
-        turn, found = camera.viewmat[:3, :3].double(), normals(camera, depth_of(frame))
+    for camera, depth in few:
+        turn, found = camera.viewmat[:3, :3].double(), normals(camera, depth)
         at, within = _pixels(camera, points)
         own = torch.full((len(points), 3), torch.nan, dtype=torch.float64)
         own[within] = found[at[:, 1], at[:, 0]] @ turn
@@ -402,13 +395,13 @@ def _unsettled(few: Sequence[Frame], depth_of: Any, points: Tensor) -> str:
     cosine = torch.cat([(one * other).sum(-1) for one, other in pairwise(seen)] or [torch.zeros(0)])
     cosine = cosine[cosine.isfinite()]
     if len(cosine) < FEW_POINTS:
-        return "Too few points show their normals to two views: angles cannot be checked"
+        return "Too few points show their normals to two views: angles cannot be checked."
     apart = float(torch.rad2deg(torch.arccos(cosine.clamp(-1.0, 1.0))).median())
     if apart <= TURNED:
         return ""
     return (
         f"Two views see the normal of the same point {apart:.0f}° apart (median): angles are not settled, and what they change "
-        "is mostly wrong; train longer, or leave correct.refractive_index out"
+        "is mostly wrong; train longer, or leave correct.refractive_index out."
     )
 
 
@@ -432,9 +425,13 @@ def _recorded(folders: Sequence[Path]) -> dict[str, dict[str, str]]:
     }
 
 
-def typical_distance(few: Sequence[Frame], depth_of: Any) -> float:
-    """Median distance over a few frames in world units, what one would give for all pixels. SceneError without surfaces."""
-    found = [distances(frame.camera, depth_of(frame)) for frame in few]
+def typical_distance(few: Sequence[tuple[Camera, Tensor]]) -> float:
+    """Median distance in world units over a few cameras with their depths [H, W]: what one would give for all pixels.
+
+    Raises:
+        SceneError: none of them sees a surface.
+    """
+    found = [distances(camera, depth) for camera, depth in few]
     known = torch.cat([d[d.isfinite()] for d in found])
     if not len(known):
         raise SceneError("the trained scene shows no surface to any of its cameras; train it longer")
@@ -523,6 +520,4 @@ def _section(outcome: Outcome, far: float, index: float | None, doubts: Sequence
         "![distance, angle, temperature and change](report/correction.png)",
     ]
     angle = "" if index is None else " and an angle"
-    return Section(
-        f"What a distance{angle} for each pixel changes", lines, values, [f"{doubt}." for doubt in doubts if doubt]
-    )
+    return Section(f"What a distance{angle} for each pixel changes", lines, values, list(doubts))

@@ -16,6 +16,7 @@ from heatsplat.datamodules.formats import dji, flir
 from heatsplat.datamodules.formats.exif import exif_in
 from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
 from heatsplat.physics.radiometry import Conditions, PlanckResponse
+from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.frame import Attitude, CameraInfo, Position, ThermalFrame, frame_name
 from heatsplat.preparation.meaning import Meaning
 
@@ -131,7 +132,7 @@ def _of_dji(path: Path, name: str, data: bytes, meaning: Meaning) -> ThermalFram
         path,
         0,
         load=lambda: dji.array_of(read_bytes(path)),
-        calibration=meaning.of_temperatures(1.0 / dji.PER_KELVIN, -273.15),
+        calibration=meaning.of_temperatures(1.0 / dji.PER_KELVIN, -KELVIN_AT_0_C),
         conditions=Conditions(**stated),
         sources=dict.fromkeys(stated, "file"),
         camera=replace(camera, serial=xmp.get("CameraSerialNumber") or camera.serial),

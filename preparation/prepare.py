@@ -109,9 +109,10 @@ def prepare(
         report.radiometry(frames, records, uncertain),
         report.pictures(target, frames, records),
     ]
-    sections += [part for part in parts if part is not None]
-    for finding in (finding for part in parts if part is not None for finding in part.findings):
-        log.warning("%s", finding)
+    for section in filter(None, parts):
+        sections.append(section)
+        for finding in section.findings:
+            log.warning("%s", finding)
     if poses:
         sections += _cameras(poses, partial(doctor, target, reading) if doctor else None, frames, place, sections)
     page = report.write_report(target, sections)

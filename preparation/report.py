@@ -21,7 +21,7 @@ from heatsplat.io.page import PAGE_FILE, plain, write_page
 from heatsplat.io.pictures import literal
 from heatsplat.io.tables import markdown_table
 from heatsplat.physics.radiometry import LIMITS, Conditions, measured_signal, surface_temperature, uncertainty
-from heatsplat.physics.units import KELVIN_AT_0_C
+from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C
 from heatsplat.preparation.conditions import InputUncertainty
 from heatsplat.preparation.devices import devices_of
 from heatsplat.preparation.frame import ThermalFrame
@@ -31,7 +31,6 @@ from heatsplat.preparation.writer import QUANTILES, rows
 BINS = 160
 SHOWN, ACROSS = 6, 3  # frames that are shown, and how many of them in a row
 LOW, MIDDLE, HIGH = 2, len(QUANTILES) // 2, len(QUANTILES) - 3  # 5 %, 50 % and 95 % of the pixels
-DAY_S = 86400.0
 TIMES = ((DAY_S, "days"), (3600.0, "hours"), (60.0, "minutes"), (1.0, "seconds"))
 LABELS = {
     "emissivity": "emissivity",
@@ -48,9 +47,8 @@ APPARENT = (
     "Apparent temperatures: emissivity is 1, and neither air nor window is corrected; files and settings say nothing else. "
     "`conditions.emissivity=0.95 conditions.reflected_c=5 conditions.distance_m=20` would."
 )
-LARGE_K = (
-    20.0  # by which conditions change the temperature of half of the pixels; under a clear sky metals have more (ours)
-)
+# Kelvin by which conditions change the temperature of half of the pixels; under a clear sky metals have more (ours).
+LARGE_K = 20.0
 NEUTRAL = {"emissivity": 1.0, "distance_m": 0.0, "window_transmission": 1.0}
 
 
@@ -141,9 +139,7 @@ def _days_apart(timed: Sequence[ThermalFrame]) -> list[str]:
 
 
 def radiometry(
-    frames: Sequence[ThermalFrame],
-    records: Sequence[Mapping[str, Any]],
-    uncertain: InputUncertainty,
+    frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]], uncertain: InputUncertainty
 ) -> Section | None:
     """What each condition is, where it comes from, what it changes and what uncertainty it brings; None for greys.
 
@@ -202,10 +198,8 @@ def radiometry(
         *markdown_table(["input", "±", *(f"at {x:.1f} °C" for x in celsius.tolist())], unsure, "llrrr"),
     ]
     values = {"combined_c": parts["combined"].tolist(), "at_c": celsius.tolist()}
-    apparent_c, surface_c = (
-        float(surface_temperature(signal, response, Conditions())[1]) - KELVIN_AT_0_C,
-        float(celsius[1]),
-    )
+    apparent_c = float(surface_temperature(signal, response, Conditions())[1]) - KELVIN_AT_0_C
+    surface_c = float(celsius[1])
     findings = _doubts(frames)
     if abs(surface_c - apparent_c) > LARGE_K:
         findings.append(
@@ -334,9 +328,8 @@ def _few_frames(frames: Sequence[ThermalFrame], quantiles: np.ndarray, unit: str
         place.set_title(literal(frame.name), fontsize=7)
     for place in places:
         place.set_axis_off()
-    figure.colorbar(
-        image, ax=list(places), label=unit, shrink=0.8, extend="both"
-    )  # the hottest and the coldest lie beyond
+    # The hottest and the coldest lie beyond.
+    figure.colorbar(image, ax=list(places), label=unit, shrink=0.8, extend="both")
     return figure
 
 

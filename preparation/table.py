@@ -32,7 +32,7 @@ def with_table(
         frames: of the recording.
         path: of the table.
         columns: its columns by what they hold: name, time, latitude_deg, ...
-        notes: gets a sentence.
+        notes: gets a sentence on what the table tells, and one on columns that are not used.
 
     Raises:
         SceneError: the table has no row for any frame or several for one, or no column that is known, or a cell cannot be read.
@@ -43,9 +43,9 @@ def with_table(
     changed = []
     for frame in frames:
         if frame.name in rows:
-            changes, told = table.changes(frame, rows[frame.name])
+            changes, read = table.changes(frame, rows[frame.name])
             frame = replace(frame, **changes)
-            used |= told
+            used |= read
         changed.append(frame)
     table.check_use(rows.values(), used)
     notes.append(f"{path.name} tells {', '.join(sorted(used)) or 'nothing'} of {len(rows)} of {len(frames)} frames")
@@ -76,7 +76,7 @@ class FrameTable:
     def read(cls, path: Path, columns: Mapping[str, str]) -> FrameTable:
         """The table in a file. Raises SceneError where it has no names of files, or nothing else that is known."""
         table = read_table(path)
-        columns = {key: _there(key, column, table, path) for key, column in columns.items()}
+        columns = {key: _column_of(key, column, table) for key, column in columns.items()}
         at = {key: table.columns.index(column) for key, column in columns.items() if column in table.columns}
         if "name" not in at:
             raise SceneError(
@@ -100,23 +100,25 @@ class FrameTable:
         frames_in = Counter(frame.path for frame in frames)
         frame_files = [frame.path.with_name(f"{frame.path.stem}_{frame.number:06d}.tiff") for frame in frames]
         by_file = {}
-        wanted = [path.as_posix() for frame, own in zip(frames, frame_files, strict=True) for path in (own, frame.path)]
+        wanted = [
+            path.as_posix() for frame, file in zip(frames, frame_files, strict=True) for path in (file, frame.path)
+        ]
         for path, names in same_files(wanted, by_name).items():
             if len(names) > 1:
                 raise SceneError(f"table={self.table.path}: {' and '.join(names)} may both be {path}; keep one of them")
             if names:
                 by_file[path] = by_name[names[0]]
         rows: dict[str, Row] = {}
-        for frame, own in zip(frames, frame_files, strict=True):
+        for frame, file in zip(frames, frame_files, strict=True):
             several = frames_in[frame.path] > 1
-            if several and own.as_posix() in by_file:
-                rows[frame.name] = by_file[own.as_posix()]
+            if several and file.as_posix() in by_file:
+                rows[frame.name] = by_file[file.as_posix()]
             elif frame.path.as_posix() in by_file:
                 line, cells = rows[frame.name] = by_file[frame.path.as_posix()]
                 if several and self._cell(cells, "time"):
                     raise SceneError(
                         f"{self.table.path}, line {line}: {frame.path.name} holds {frames_in[frame.path]} frames, which have "
-                        f"no time in common; give each a row, as {own.stem}"
+                        f"no time in common; give each a row, as {file.stem}"
                     )
         if not rows:
             raise SceneError(
@@ -184,16 +186,18 @@ class FrameTable:
             ) from error
 
 
-def _there(key: str, column: str, table: Table, path: Path) -> str:
+def _column_of(key: str, column: str, table: Table) -> str:
     """The column of ``key`` in a table: the one that is named, or another usual name of it that the table has.
 
     Raises:
-        SceneError: the table has no column of a name that is none of the usual ones.
+        SceneError: the table has no column of a name that is none of the usual ones, or nothing can be read of ``key``.
     """
+    if key not in SPELLINGS:
+        raise SceneError(f"table_columns.{key}={column}: a table tells {', '.join(SPELLINGS)}, no {key}")
     usual = SPELLINGS[key]
     if column not in table.columns and column not in usual:
         raise SceneError(
-            f"table={path} has no column {column!r}, as table_columns.{key} says; it has {', '.join(table.columns)}"
+            f"table={table.path} has no column {column!r}, as table_columns.{key} says; it has {', '.join(table.columns)}"
         )
     return next((name for name in (column, *usual) if name in table.columns), column)
 

@@ -25,6 +25,7 @@ from heatsplat.datamodules.colmap import FRAMES_FILE, WORLD_FILE
 from heatsplat.datamodules.formats.images import SUFFIXES
 from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.datamodules.timestamps import instant
+from heatsplat.doctor.base import some
 from heatsplat.io.files import read_json_object, write_atomically
 from heatsplat.io.tables import write_csv
 from heatsplat.io.tiff import write_temperature
@@ -55,9 +56,8 @@ class Writer:
     def __init__(self, target: Path, uncertain: InputUncertainty, keep_counts: bool) -> None:
         self.target, self.uncertain, self.keep_counts = target, uncertain, keep_counts
         self.images = target / "images"
-        self.dead: dict[
-            str, np.ndarray
-        ] = {}  # by name of a frame: [H, W] bool, pixels of its detector that say nothing
+        # By name of a frame: [H, W] bool, pixels of its detector that say nothing.
+        self.dead: dict[str, np.ndarray] = {}
 
     def check(self, frames: Sequence[ThermalFrame]) -> None:
         """Raises SceneError where the folder holds images of another recording, or there are no counts to keep."""
@@ -69,7 +69,7 @@ class Writer:
         there = (p for p in sorted(self.images.glob("*")) if p.suffix.lower() in SUFFIXES)
         if foreign := [p.name for p in there if p.stem not in ours]:
             raise SceneError(
-                f"{self.images} holds {len(foreign)} images that are no frames of this recording: {', '.join(foreign)}. If their "
+                f"{self.images} holds {len(foreign)} images that are no frames of this recording: {some(foreign)}. If their "
                 f"files were taken out of the source, delete {self.images}, which is then written anew (rm -r "
                 f"{shlex.quote(str(self.images))}); else give an empty folder as target"
             )
@@ -193,15 +193,19 @@ def image_name(frame: ThermalFrame) -> str:
 
 
 def write_world(target: Path, metres_per_unit: float | None, axes: str | None = None) -> None:
-    """Says in a prepared folder what one unit of its world is, and its axes where they are known ("east, north, up"), or takes
-    away what an earlier search said."""
+    """Says in a prepared folder how long one unit of its world is; None takes away what an earlier search said.
+
+    Args:
+        target: the prepared folder.
+        metres_per_unit: metres of one unit, or None where that is not known.
+        axes: directions of the world's axes, such as "east, north, up"; None where they are not known.
+    """
     path = target / WORLD_FILE
     if metres_per_unit is None:
         path.unlink(missing_ok=True)
     else:
-        write_atomically(
-            path, json.dumps({"metres_per_unit": metres_per_unit} | ({"axes": axes} if axes else {})) + "\n"
-        )
+        world = {"metres_per_unit": metres_per_unit} | ({"axes": axes} if axes else {})
+        write_atomically(path, json.dumps(world) + "\n")
 
 
 def write_bounds(target: Path, low: float, high: float) -> None:

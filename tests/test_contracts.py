@@ -38,6 +38,11 @@ def test_a_camera_takes_arrays_and_keeps_its_gradients():
     assert camera.viewmat is viewmat and camera.K.dtype == torch.float64 and camera.resized(4, 3).width == 4
 
 
+def test_a_camera_keeps_all_digits_of_lists():
+    rows = [[0.1, 0.0, 1 / 3], [0.0, 0.1, 0.7], [0.0, 0.0, 1.0]]
+    assert Camera(torch.eye(4), rows, 8, 6).K.tolist() == rows
+
+
 def changed(matrix, row, column, value):
     matrix[row, column] = value
     return matrix

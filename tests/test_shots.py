@@ -12,12 +12,10 @@ import torch
 from weathered import CAMERA, make_scene
 
 from heatsplat.contracts import SceneError, View, ViewSet
-from heatsplat.io.quantities import Clock
 from heatsplat.io.tiff import read_temperature
 from heatsplat.shots import (
     ShotFiles,
     checked_unseen,
-    clock_of,
     deviations_told,
     shot_frames,
     sightings,
@@ -98,13 +96,6 @@ def test_a_still_shows_the_moment_of_its_view_and_a_film_the_record():
     assert [film[0].time_s, film[-1].time_s] == [min(scene.train.times_s), max(scene.train.times_s)]
     assert [frame.name for frame in film] == [taken.name.replace(".", f"_000{i}.") for i in range(3)]
     assert shot_frames(scene, "view", 5.0, 1, 1)[0].time_s == 5.0
-
-
-def test_the_clock_is_that_of_the_weather_or_of_the_camera():
-    scene = replace(make_scene(), notes={"clock_at_zero_s": 5.0})
-    assert clock_of(scene) is None  # whose weather counts from some zero of its own
-    assert clock_of(replace(scene, weather=None)) == Clock(5.0, zone="")
-    assert clock_of(replace(scene, weather=replace(scene.weather, notes={"utc_at_zero_s": 7.0}))) == Clock(7.0)
 
 
 def test_a_figure_names_the_view_its_moment_and_the_clock(tmp_path):

@@ -23,8 +23,8 @@ from benchmarks.peers.report import TABLE_FILE, Row, equal_psnr, write
 from benchmarks.peers.scenes import SharedScene, shared
 from benchmarks.peers.training import score, train_heatsplat, train_opensplat
 from benchmarks.renderer.peers import from_path
-from heatsplat.contracts import SceneError
-from heatsplat.studies.options import check_count, whole_numbers
+from heatsplat.contracts import SceneError, check_count
+from heatsplat.studies.options import whole_numbers
 
 log = logging.getLogger("heatsplat")
 

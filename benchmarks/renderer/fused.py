@@ -15,11 +15,11 @@ from benchmarks.renderer.floors import Machine
 from benchmarks.renderer.report import training_table
 from benchmarks.renderer.scenes import Case, build
 from benchmarks.renderer.steps import training_rows
-from heatsplat.contracts import SceneError, check_numbers
+from heatsplat.contracts import SceneError, check_count, check_numbers
 from heatsplat.io.tables import markdown_table, write_csv
 from heatsplat.kernels.peak import memory_rate, vector_rate
 from heatsplat.renderers import rasterization
-from heatsplat.studies.options import check_count, non_empty
+from heatsplat.studies.options import non_empty
 from heatsplat.training.adam import OnePassAdam
 
 MAPS = 3
@@ -50,11 +50,8 @@ def run(
     Raises:
         SceneError: a list is empty, or a number counts nothing.
     """
-    cases, threads, views = (
-        non_empty("study.cases", cases),
-        non_empty("study.threads", threads),
-        non_empty("study.views", views),
-    )
+    cases, threads = non_empty("study.cases", cases), non_empty("study.threads", threads)
+    views = non_empty("study.views", views)
     non_empty("study.methods", list(methods))
     for case in cases:
         check_numbers("each of study.cases", case, 3, SceneError)

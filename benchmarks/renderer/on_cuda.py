@@ -14,13 +14,12 @@ import torch
 from benchmarks.renderer.scenes import Case, build
 from benchmarks.renderer.steps import STILL, at_home, still_scene
 from heatsplat.composition import compose
-from heatsplat.contracts import SceneError, check_option
+from heatsplat.contracts import SceneError, check_count, check_option
 from heatsplat.io.tables import markdown_table, write_csv
 from heatsplat.kernels import gpu
 from heatsplat.renderers import rasterization
 from heatsplat.runs.run import build_module
 from heatsplat.runs.stepping import Stepper
-from heatsplat.studies.options import check_count
 
 VIEWS = 10  # that steps and renders take in turn
 WARM_UP = 8  # rounds in which kernels are compiled and memory is found

@@ -12,8 +12,8 @@ from typing import Any
 __version__ = "0.1.0"
 __all__ = ["compose", "load", "train"]
 
-# A wheel has conf/ and datamodules/ inside the package. In a checkout they lie beside src/, where setup.py takes them from,
-# and the package looks for them there: with or without an editable install, and in any copy of the sources.
+# A wheel has conf/, datamodules/ and preparation/ inside the package. In a checkout they lie beside src/, where setup.py takes
+# them from, and the package looks for them there: with or without an editable install, and in any copy of the sources.
 CHECKOUT = next((root for root in [Path(__file__).resolve().parents[2]] if (root / "datamodules").is_dir()), None)
 if CHECKOUT is not None:
     __path__.append(str(CHECKOUT))

@@ -92,7 +92,8 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
         try:
             try:
                 if name in SETTINGS and not {"--help", "-h"}.isdisjoint(sys.argv[1:]):
-                    return print(_help(name, job.__doc__ or ""))
+                    print(_help(name, job.__doc__ or ""))
+                    return None
                 return main()
             finally:
                 sys.stdout.flush()  # here, where a reader that has gone is no error, not when Python ends

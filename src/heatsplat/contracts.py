@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# For all who need torch anyway; who does not imports heatsplat.errors.
+# Also under this name, for packages that need torch anyway; what must start without it imports heatsplat.errors.
 from heatsplat.errors import SceneError, check_count, check_numbers, check_option, is_number  # noqa: F401
 
 SHARE_OF_RANGE = "share of the image's range"  # unit of a course in image units
@@ -93,7 +93,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name, shape in (("viewmat", (4, 4)), ("K", (3, 3))):
-            matrix = torch.as_tensor(getattr(self, name)).to(torch.float64)
+            matrix = torch.as_tensor(getattr(self, name), dtype=torch.float64)
             if tuple(matrix.shape) != shape:
                 raise SceneError(f"camera needs viewmat [4, 4] and K [3, 3], got {name} {list(matrix.shape)}")
             if not bool(matrix.isfinite().all()):

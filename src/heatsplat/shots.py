@@ -17,7 +17,7 @@ from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_coun
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
 from heatsplat.io.pictures import Bar, Panel, compose, image_panel, write_figure, write_png
-from heatsplat.io.quantities import Clock, moment
+from heatsplat.io.quantities import clock_of, moment
 from heatsplat.io.tiff import write_temperature
 from heatsplat.io.video import video as film
 
@@ -99,15 +99,6 @@ def checked_unseen(name: str, value: str | float) -> str:
     word = "nan" if value != value else value
     check_option(name, word, UNSEEN, SceneError)
     return word
-
-
-def clock_of(scene: SceneData) -> Clock | None:
-    """The clock of the record: that of the weather, or of the camera (``notes["clock_at_zero_s"]``); None where none is known."""
-    if scene.weather is not None:
-        known = scene.weather.notes.get("utc_at_zero_s")
-        return None if known is None else Clock(known)
-    known = scene.notes.get("clock_at_zero_s")
-    return None if known is None else Clock(known, zone="")
 
 
 def first_free_id(scene: SceneData) -> int:

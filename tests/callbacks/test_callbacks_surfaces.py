@@ -30,9 +30,8 @@ def test_the_warm_patch_is_found(tmp_path):
     ExtremeSurfaces(views=4, share=0.02).on_test_epoch_end(None, module)
     rows = read_csv(tmp_path / SURFACES_FILE)
     hottest, times = rows[0], module.scene.train.times_s
-    taken = min(
-        times, key=lambda time_s: abs(time_s - (min(times) + max(times)) / 2)
-    )  # of an image: not between nights
+    middle = (min(times) + max(times)) / 2
+    taken = min(times, key=lambda time_s: abs(time_s - middle))  # of an image: not between nights
     assert hottest["kind"] == "hottest" and hottest["time_s"] == pytest.approx(taken)
     assert hottest["mean_c"] == pytest.approx(float(RANGE.to_celsius(warmth(taken))), abs=0.01)
     assert hottest["area"] == pytest.approx(0.2, rel=0.2) and hottest["unit"] == "square units"

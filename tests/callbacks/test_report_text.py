@@ -2,8 +2,12 @@
 
 import html
 
+import numpy as np
+import pytest
+from PIL import Image
+
 from heatsplat.callbacks.report import show
-from heatsplat.callbacks.report_text import markdown
+from heatsplat.callbacks.report_text import _picture, markdown
 from heatsplat.io.page import page
 from heatsplat.io.results import RunResults
 
@@ -21,3 +25,10 @@ def test_names_are_shown_as_they_are(tmp_path, capsys):
     show(results, tmp_path / "[old]", tmp_path / "[old]" / "a [b].png")
     said = " ".join(capsys.readouterr().out.split())
     assert "[new](x)" in said and ":fire:" in said and "[old]/report.md" in said and "a [b].png" in said
+
+
+@pytest.mark.parametrize("name", ["IMG (1).png", "Bild#1 50%ü_[x].png", "a*b_c_`d`.png", "<b>.png"])
+def test_pictures_are_found_whatever_they_are_called(tmp_path, name):
+    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / name)
+    text = page(f"# run\n\n{_picture(tmp_path / name, tmp_path)}\n", tmp_path)
+    assert text.count("<img") == 1 and f'alt="{html.escape(name[:-4])}"' in text and 'width="8"' in text

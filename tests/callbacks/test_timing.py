@@ -72,9 +72,8 @@ def test_a_resumed_run_goes_on_counting(tmp_path):
     assert stored_cpu >= 5 * 0.004 and cost["cpu_seconds"] >= stored_cpu + 5 * 0.004
     assert cost["steps_per_second"] == pytest.approx((8 - 3 + 8 - 3) / cost["train_seconds"])
     assert cost["warmup_seconds"] >= stored["warmup"] + 3 * 0.01
-    assert (
-        cost["evaluation_seconds"] >= 0.9
-    )  # 3 views at steps 4, 12 and 16; the one at step 8 came after the checkpoint
+    # 3 views at steps 4, 12 and 16; the one at step 8 came after the checkpoint
+    assert cost["evaluation_seconds"] >= 0.9
 
 
 def test_what_was_chosen_before_training_has_its_own_time(tmp_path):

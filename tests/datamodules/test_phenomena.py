@@ -170,6 +170,5 @@ def test_tiles_are_finer_than_pixels_of_low_resolution_and_coarser_than_those_of
     pixel_m = 2.2 / lens.fx  # at the middle of the path
     tiles = [pattern.tile_m for pattern in PRESETS["fine_texture"].start_k.values() if pattern.step == 3.0]
     assert len(tiles) == 6
-    assert (
-        4 * pixel_m < min(tiles) and max(tiles) < 2.1 * 4 * pixel_m
-    )  # one to two pixels of a quarter of the resolution
+    # One to two pixels of a quarter of the resolution.
+    assert 4 * pixel_m < min(tiles) and max(tiles) < 2.1 * 4 * pixel_m

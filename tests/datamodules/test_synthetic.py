@@ -350,6 +350,7 @@ def test_bad_presets_are_named():
     ("mark", "said"),
     [
         ("sparse/0/cameras.bin", "did you mean data=colmap. The folder has sparse/0"),
+        ("colmap/sparse/cameras.txt", "did you mean data=colmap. The folder has colmap/sparse"),
         ("scene/transforms.json", "did you mean data=nerfstudio. The folder has scene/transforms.json"),
         ("scene/thermal/sparse/0/cameras.bin", "did you mean data=rhd"),
         ("IR_0001.jpg", "say with data=... what the folder holds .*prepare.py"),

@@ -15,18 +15,6 @@ SITE = Site(47.0, 9.0, 500.0)
 MIDNIGHT_S = 1720656000.0
 
 
-@pytest.fixture
-def table(tmp_path):
-    """Writes lines as a table and returns its path."""
-
-    def write(*lines: str):
-        path = tmp_path / "weather.csv"
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        return path
-
-    return write
-
-
 def test_columns_are_known_by_name_and_unit(table):
     path = table(
         "# from the station on the roof",

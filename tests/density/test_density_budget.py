@@ -120,9 +120,8 @@ def test_a_round_that_begins_anew_fills_up_to_the_same_b():
     for step in range(100):
         change = refine(policy, cloud, step)
         numbers += [] if change is None else [len(cloud)]
-    assert (
-        numbers[0] < 230 and numbers[-1] == max(numbers) == 250
-    )  # 190 stayed, and not all that are missing come at once
+    # 190 stayed, and not all that are missing come at once.
+    assert numbers[0] < 230 and numbers[-1] == max(numbers) == 250
 
 
 def test_more_than_b_at_the_start_stay_and_none_is_added():

@@ -280,10 +280,8 @@ def test_selections_and_single_choices():
     assert set(assembly.choices(config("method=auto", "effects=none")["effects"]).values()) == {"off"}
     one = assembly.choices(config("method=auto", "effects=all", "effects.agc=off", "effects.tone=auto")["effects"])
     assert one == dict.fromkeys(assembly.NAMES, "on") | {"agc": "off", "tone": "auto", "semi_infinite": "auto"}
-    assert assembly.explicit_choices({"solar": True, "agc": False}) == {
-        "solar": "on",
-        "agc": "off",
-    }  # YAML's on and off
+    yaml_words = {"solar": True, "agc": False}  # what YAML makes of on and off
+    assert assembly.explicit_choices(yaml_words) == {"solar": "on", "agc": "off"}
 
 
 def test_choices_that_cannot_be_are_refused():

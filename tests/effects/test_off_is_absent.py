@@ -535,13 +535,8 @@ def test_a_drift_without_gains_is_one_addition():
         part.raw_offset.copy_(drawn("offset", (7,)))
         assert torch.equal(part(image, frame), plain())
     seen = operators(lambda: part(image, frame).sum().backward()), operators(lambda: plain().sum().backward())
-    looked_up = {
-        "aten::eq",
-        "aten::nonzero",
-        "aten::item",
-        "aten::_local_scalar_dense",
-        "aten::len",
-    }  # whose image it is
+    # Whose image it is.
+    looked_up = {"aten::eq", "aten::nonzero", "aten::item", "aten::_local_scalar_dense", "aten::len"}
     more = {name: count for name, count in (seen[0] - seen[1]).items() if name not in looked_up}
     assert not {"aten::mul", "aten::tanh", "aten::lerp"} & set(more), more
 

@@ -1,8 +1,11 @@
 """Names of quantities as people read them."""
 
-import numpy as np
+from dataclasses import replace
 
-from heatsplat.io.quantities import Clock, impossible, moment, words_and_unit
+import numpy as np
+from weathered import make_scene
+
+from heatsplat.io.quantities import Clock, clock_of, impossible, moment, words_and_unit
 
 
 def test_the_longest_suffix_is_the_unit():
@@ -20,6 +23,13 @@ def test_times_are_told_in_the_unit_that_suits_them():
 def test_the_clock_stands_beside_a_time_where_it_is_known():
     assert moment(39743.4, Clock(1722965689.0)) == "11.04 h (2024-08-07 04:37 UTC)"
     assert Clock(1722965689.0, zone="").at(0.0, "seconds") == "2024-08-06 17:34:49"
+
+
+def test_the_clock_is_that_of_the_weather_or_of_the_camera():
+    scene = replace(make_scene(), notes={"clock_at_zero_s": 5.0})
+    assert clock_of(scene) is None  # whose weather counts from some zero of its own
+    assert clock_of(replace(scene, weather=None)) == Clock(5.0, zone="")
+    assert clock_of(replace(scene, weather=replace(scene.weather, notes={"utc_at_zero_s": 7.0}))) == Clock(7.0)
 
 
 def test_shares_beyond_what_is_possible_are_told():

@@ -145,10 +145,8 @@ def test_derivatives_by_every_parameter_are_those_of_the_values(climate, solutio
             )
             ours = gradient[:, column] if name == "normals" else gradient
             scale = ours.abs().max().clamp(min=1e-3)
-            assert ((up - down) / 2e-4 - ours).abs().max() < 0.05 * scale, (
-                name,
-                column,
-            )  # float32 tables; sensitivities of second order
+            # Tables are float32, and sensitivities of second order.
+            assert ((up - down) / 2e-4 - ours).abs().max() < 0.05 * scale, (name, column)
 
 
 OFF = {  # what a balance is without, and the same said by numbers to the balance that has everything

@@ -109,7 +109,6 @@ def test_a_corrected_scene_is_no_target_of_a_preparation_nor_the_other_way_round
     (other / RECORD).unlink()
     with pytest.raises(SceneError, match="is of something else"):
         Target(other, CORRECTED).claim()
-    (other / "report.md").write_text(
-        "# other, corrected pixel by pixel by the trained scene a\n"
-    )  # of earlier versions
+    # Of earlier versions, which left no record.
+    (other / "report.md").write_text("# other, corrected pixel by pixel by the trained scene a\n")
     Target(other, CORRECTED).claim()

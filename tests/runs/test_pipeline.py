@@ -129,7 +129,8 @@ def test_several_devices_for_one_scene_are_refused(devices):
 
 @pytest.mark.parametrize("devices", ["1", "[0]", "auto", "'1'"])
 def test_one_device_passes(devices):
-    checked(heatsplat.compose(["method=3dgs", f"trainer.devices={devices}"]))
+    config = heatsplat.compose(["method=3dgs", f"trainer.devices={devices}"])
+    assert checked(config) == config
 
 
 def test_a_checkpoint_of_a_gpu_is_looked_at_where_there_is_none(trained, tmp_path):

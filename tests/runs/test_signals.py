@@ -12,10 +12,8 @@ from heatsplat.runs.signals import stoppable
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGUSR2"])
 def test_who_asked_a_job_to_stop_hears_of_it_when_it_has(name, ctrl_c):
     heard, number = [], signal.Signals[name]
-    before, before_ctrl_c = (
-        signal.signal(number, lambda got, _: heard.append(got)),
-        signal.signal(signal.SIGINT, ctrl_c),
-    )
+    before = signal.signal(number, lambda got, _: heard.append(got))
+    before_ctrl_c = signal.signal(signal.SIGINT, ctrl_c)
     try:
         with pytest.raises(KeyboardInterrupt), stoppable():
             os.kill(os.getpid(), number)

@@ -31,9 +31,8 @@ def test_an_option_without_a_value_is_named(empty):
 
 
 def test_a_name_that_there_is_not_and_a_number_that_counts_nothing_are_told_one_by_one():
-    assert subset_of("study.only", "hot", ["hot", "cold"]) == ["hot"] and whole_numbers("study.seeds", 0, least=0) == [
-        0
-    ]
+    assert subset_of("study.only", "hot", ["hot", "cold"]) == ["hot"]
+    assert whole_numbers("study.seeds", 0, least=0) == [0]
     with pytest.raises(SceneError, match="each of study.only must be one of hot, cold, got 'warm'"):
         subset_of("study.only", ["hot", "warm"], ["hot", "cold"])
     with pytest.raises(SceneError, match="study.steps must be a whole number, 1 or more, got long"):

@@ -324,9 +324,8 @@ def test_heat_from_within_and_bodies_without_an_end_tell_what_walls_are():
     assert all((splats[name].grad != 0).all() for name in ("inner_rise", "log_rate"))
     told = model.attributes(splats, Query(time_s=0.0))
     exchange = told["convection_w_m2_k"] / (1 - told["radiation_share"])
-    lets_through = (
-        2 * exchange / (40.0 - celsius(model.reference_k).float())
-    )  # 2 K where a surface is as warm as the mean air
+    # 2 K where a surface is as warm as the mean air.
+    lets_through = 2 * exchange / (40.0 - celsius(model.reference_k).float())
     torch.testing.assert_close(told["heat_loss_w_m2"], lets_through * (40.0 - told["mean_surface_c"]))
     torch.testing.assert_close(told["u_value_w_m2_k"], lets_through / (1 + 0.04 * lets_through))
     torch.testing.assert_close(told["effusivity_j_m2_k_s05"], exchange * told["settling_time_h"].mul(3600).sqrt())

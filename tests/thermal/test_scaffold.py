@@ -74,10 +74,8 @@ def test_anchors_out_of_view_have_no_gaussians_and_ids_count_gaussians():
     model, splats = anchors(BEHIND, AHEAD, ASIDE, [0.5, 0.0, 4.0])
     for network in model.networks.values():
         network[2].bias.copy_(torch.linspace(0.1, 1.0, len(network[2].bias)))
-        network[0].weight[0, 2], network[2].weight[0, 0] = (
-            1.0,
-            1.0,
-        )  # the first Gaussian depends on the direction along x
+        # The first Gaussian depends on the direction along x.
+        network[0].weight[0, 2], network[2].weight[0, 0] = 1.0, 1.0
     made, every = seen(model, splats)
     assert made.in_view.tolist() == [False, True, False, True]
     assert not made.quats[[0, 1, 4, 5]].any() and not made.opacities[:, [0, 1, 4, 5]].any()

@@ -214,9 +214,8 @@ def test_what_the_model_inside_answers_comes_out(wrapped):
     assert model.doubts()["needle"].func.__self__ is probe
     assert model.effects()["probing"] == {"how": "deep"}
     assert model.cost >= 10**9
-    assert (
-        model.beyond_record.startswith("it probes on") and "emits" not in model.beyond_record
-    )  # a companion is silent
+    # A companion is silent.
+    assert model.beyond_record.startswith("it probes on") and "emits" not in model.beyond_record
 
 
 def test_wrappers_and_parts_say_what_they_assume_beyond_the_record():

@@ -121,7 +121,7 @@ def test_cameras_that_are_given_stay_and_have_nothing_to_learn():
     cameras.prepare(scene)
     frame = scene.frames[1]
     assert cameras.of(frame, 0.5) is frame.camera and cameras.align_steps == 0
-    assert not list(cameras.parameters()) and cameras.found() is None and cameras.regularisers() == {}
+    assert not list(cameras.parameters()) and cameras.learned() is None and cameras.regularisers() == {}
 
 
 def test_before_its_start_nothing_is_learned():

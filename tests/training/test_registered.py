@@ -68,7 +68,7 @@ def trained(model, folder, density=None):
     ("model", "told"),
     [
         (Listed, r"thermal.gains of Listed holds parameters in a list, .* use nn.ParameterList"),
-        (Late, r"thermal.gain: the optimiser does not know of this parameter, .* in __init__ or prepare"),
+        (Late, r"the optimiser does not know the parameters thermal.gain, .* in __init__ or prepare"),
     ],
 )
 def test_parameters_that_the_optimiser_does_not_know_are_refused(model, told, tmp_path):

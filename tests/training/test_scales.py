@@ -44,6 +44,16 @@ def test_a_scene_that_is_divided_otherwise_has_the_moments_of_training(trained, 
     torch.testing.assert_close(scene.truth(points, times), trained.truth(points, times))
 
 
+def test_the_clock_of_a_camera_moves_with_second_0(trained, later):
+    """Of scenes without weather, which know the time of day by it."""
+    scene = replace(later, weather=None, notes={"clock_at_zero_s": 1.7e9})
+    moved = on_scales(scene, scales_of(trained))
+    before, after = views_of(scene), views_of(moved)
+    for name, view in after.items():
+        assert moved.notes["clock_at_zero_s"] + view.time_s == pytest.approx(1.7e9 + before[name].time_s, abs=1e-6)
+    assert moved.notes["clock_at_zero_s"] != 1.7e9 and scene.notes["clock_at_zero_s"] == 1.7e9
+
+
 def test_image_values_mean_the_temperatures_of_training(trained):
     bounds = trained.thermal_range
     wider = replace(trained, thermal_range=ThermalRange(bounds.min_c - 7, bounds.max_c + 30))

@@ -583,9 +583,8 @@ def test_a_line_shows_its_profile_and_delete_takes_the_last_thing_away(page):
     for point in line["profile"][:: len(profile) // 5]:
         assert page.execute_script(read, point["x"], point["y"]) == pytest.approx(point["value"], abs=1e-4)
     assert page.execute_script("return document.querySelectorAll('#profile .curve').length") == 1
-    assert (
-        page.execute_script("return document.querySelectorAll('#marks .area').length") == 4
-    )  # twice the line, both ends
+    marks = page.execute_script("return document.querySelectorAll('#marks .area').length")
+    assert marks == 4  # twice the line, both ends
     kept = page.execute_script("""const kept = viewer.picturePage(), ratio = $('canvas').width / $('canvas').clientWidth;
       const {x, y} = viewer.areas.list[0].profile[30], size = 6 * ratio;
       const around = kept.getContext('2d').getImageData(x - size / 2, y - size / 2, size, size);
@@ -625,10 +624,8 @@ def test_differences_are_counted_from_a_probe_of_choice(page):
     assert f"Δ {second - first:+.2f}".replace("-", "−") in shown[1] and "Δ✕" in shown[0]
     page.execute_script("document.querySelectorAll('#probes li')[0].querySelectorAll('button')[1].click()")
     page.execute_script("viewer.frame(performance.now())")
-    assert page.execute_script("return [viewer.probes.reference, $('probes').textContent.includes('Δ')]") == [
-        None,
-        False,
-    ]
+    left = page.execute_script("return [viewer.probes.reference, $('probes').textContent.includes('Δ')]")
+    assert left == [None, False]
 
 
 def test_tables_tell_the_clock_and_the_coordinates_of_files_where_they_are_known(page):
@@ -636,15 +633,11 @@ def test_tables_tell_the_clock_and_the_coordinates_of_files_where_they_are_known
       Object.assign(viewer.told, {start: 1782885600, utc: true, origin: [500000, 4000000, 0]});""")
     head, row, *_ = page.execute_script("return viewer.probes.table()").split("\n")
     told = dict(zip(head.split(","), row.split(","), strict=True))
-    number, x = next((name, value) for name, value in told.items() if name.endswith(" x"))
+    x = next(value for name, value in told.items() if name.endswith(" x"))
     start = page.execute_script("return viewer.probes.times[0]")
-    assert (
-        told["clock (UTC)"]
-        == np.datetime64(round(1e3 * (1782885600 + start)), "ms").item().isoformat(timespec="milliseconds") + "Z"
-    )
-    assert float(x) == pytest.approx(500000 + page.execute_script("return viewer.probes.list[0].point[0]"), abs=1e-5), (
-        number
-    )
+    clock = np.datetime64(round(1e3 * (1782885600 + start)), "ms").item().isoformat(timespec="milliseconds")
+    assert told["clock (UTC)"] == f"{clock}Z"
+    assert float(x) == pytest.approx(500000 + page.execute_script("return viewer.probes.list[0].point[0]"), abs=1e-5)
 
 
 def test_the_legend_says_that_its_ends_hold_all_beyond(page):

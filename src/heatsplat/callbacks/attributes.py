@@ -107,9 +107,10 @@ class LearnedValues(pl.Callback):
             with torch.inference_mode(False), torch.no_grad():
                 off = Uncertainty(module).of_attributes(frame)
         rows = []
-        for name, values in told.items():
+        for name, of_each in told.items():
             words, unit = words_and_unit(name)
-            ends = _quantiles(values.double().cpu().numpy(), weights, (0.05, 0.5, 0.95))
+            values = of_each.double().cpu().numpy()
+            ends = _quantiles(values, weights, (0.05, 0.5, 0.95))
             if ends is not None:
                 low, median, high = (float(f"{end:.6g}") for end in ends)
                 usual = _quantiles(off[name].double().cpu().numpy(), weights, (0.5,)) if name in off else None
@@ -122,7 +123,7 @@ class LearnedValues(pl.Callback):
                         "low": low,
                         "high": high,
                         "deviation": deviation,
-                        "remark": _remark(impossible(name, values.double().cpu().numpy(), weights), scene) or None,
+                        "remark": _remark(impossible(name, values, weights), scene) or None,
                     }
                 )
         columns = ("name", "unit", "median", "low", "high", "deviation", "remark")

@@ -12,7 +12,9 @@ from heatsplat.contracts import Camera, evenly_spread
 
 log = logging.getLogger("heatsplat")
 
-OFF = 0.2  # of the squared error: it falls by none where cameras are right, by a sixth where images lag or all are off together
+# Fall of the squared error from which cameras are told to be off. It falls by nothing where they are right, and by a sixth where
+# images lag or all cameras are off by the same.
+OFF = 0.2
 
 
 class CameraCheck(pl.Callback):

@@ -41,7 +41,7 @@ def _machine(device: torch.device) -> str:
     return f"{torch.cuda.get_device_name(device)}; {processor()}" if device.type == "cuda" else processor()
 
 
-def describe_data(scene: SceneData, modality: str) -> dict[str, Any]:
+def describe_data(scene: SceneData) -> dict[str, Any]:
     """What the data are, for metrics.json: counts, sizes and ranges, then what the loader found and assumed."""
     sizes = sorted({f"{frame.camera.width}x{frame.camera.height}" for frame in scene.frames})
     times = [frame.time_s for frame in scene.frames if frame.time_s is not None]

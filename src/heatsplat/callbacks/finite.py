@@ -32,11 +32,15 @@ class FiniteGuard(pl.Callback):
         if every < 1:
             raise ValueError(f"FiniteGuard(every={every}): checks must be at least 1 step apart")
         self.every = every
-        self._seen: str | None = None
         self._frame: Frame | None = None
 
     def on_train_batch_start(self, trainer: pl.Trainer, module: pl.LightningModule, view: View, *_: Any) -> None:
-        self._seen, self._frame = view.frame.name, view.frame
+        self._frame = view.frame
+
+    @property
+    def _seen(self) -> str | None:
+        """Name of the training image that the step saw."""
+        return None if self._frame is None else self._frame.name
 
     def on_before_optimizer_step(
         self, trainer: pl.Trainer, module: pl.LightningModule, optimizer: torch.optim.Optimizer

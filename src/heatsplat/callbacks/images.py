@@ -22,10 +22,9 @@ from heatsplat.io.pictures import (
     write_figure,
     write_png,
 )
-from heatsplat.io.quantities import moment
+from heatsplat.io.quantities import clock_of, moment
 from heatsplat.metrics.mae import mae_c
 from heatsplat.metrics.psnr import psnr
-from heatsplat.shots import clock_of
 
 RANGE_VIEWS = 12  # training views over which the ends of the colours are taken
 RANGE_PIXELS = 20_000  # of each of them, at most, and of each test view for the ends of the errors

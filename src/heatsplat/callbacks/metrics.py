@@ -130,7 +130,7 @@ class QualityMetrics(pl.Callback):
         clocks = {name: cost.get(name) for name in ("train_seconds", "cpu_seconds")}
         self._log(module, "val", means, step)
         if clocks["train_seconds"] is not None:
-            self._log(module, "val_by_seconds", means, round(clocks["train_seconds"]))
+            self._log(module, "val_by_seconds", means, round(clocks["train_seconds"]), by_steps=False)
         before = self.curve[-1].get("loss") if self.curve and self.curve[-1]["step"] == step else None
         loss = float(self._losses) / self._steps if self._steps else before
         self._losses, self._steps = 0.0, 0
@@ -206,14 +206,21 @@ class QualityMetrics(pl.Callback):
             return "the images have no channel of temperature (pseudo-colour), or every error exceeds the outlier rule"
         return "no test image has a region of interest with such pixels"
 
-    def _log(self, module: pl.LightningModule, tag: str, scores: Mapping[str, float | None], step: int) -> None:
-        """Scores to the loggers and to the trainer, where checkpoints may monitor them.
+    def _log(
+        self,
+        module: pl.LightningModule,
+        tag: str,
+        scores: Mapping[str, float | None],
+        step: int,
+        by_steps: bool = True,
+    ) -> None:
+        """Scores to the loggers (``add_scalars``) and to the trainer, where checkpoints may monitor them.
 
         Lightning's own way to the logger counts steps from zero, one less than every other curve.
         """
         known = {f"{tag}/{name}": value for name, value in scores.items() if value is not None}
         module.log_dict(known, logger=False)
-        add_scalars(module, known, step, by_steps="_by_" not in tag)
+        add_scalars(module, known, step, by_steps)
 
     # Resume ----------------------------------------------------------------------------------------------------------
 

@@ -14,9 +14,8 @@ from torch import Tensor
 from heatsplat.callbacks.board import add_picture
 from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, evenly_spread
 from heatsplat.io.pictures import figure_picture, literal, write_png
-from heatsplat.io.quantities import time_unit
+from heatsplat.io.quantities import clock_of, time_unit
 from heatsplat.io.tables import write_csv
-from heatsplat.shots import clock_of
 
 PROBES_PICTURE = "renders/probes.png"
 CANDIDATES = 16  # validation cameras that are tried for a view of the probes

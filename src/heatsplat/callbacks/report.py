@@ -60,7 +60,7 @@ class Report(pl.Callback):
     def on_test_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         folder, results = module.output_dir, module.results
         results.run = describe_run(trainer, module) | results.run
-        results.data = describe_data(module.scene, module.modality) | results.data
+        results.data = describe_data(module.scene) | results.data
         results.effects = results.effects or describe_effects(module)
         results.versions = collect_versions()
         curves = draw_curves(folder)

@@ -19,7 +19,7 @@ from heatsplat.geometry.coverage import DEPTH_TOLERANCE, surface_depth
 from heatsplat.geometry.extremes import Surface, extremes
 from heatsplat.geometry.looks import Look
 from heatsplat.geometry.projection import to_camera, to_pixels
-from heatsplat.io.pictures import Bar, Panel, colorize, compose, lettering, write_png
+from heatsplat.io.pictures import Bar, Panel, colorize, compose, enlarged, lettering, write_png
 from heatsplat.io.quantities import moment
 from heatsplat.io.tables import write_csv
 from heatsplat.shots import SIGHTING_SIZE, at_time
@@ -95,7 +95,8 @@ def on_earth(scene: SceneData, points: Sequence[Tensor]) -> list[dict[str, Any]]
         place = None
     if place is None or place.crs is None:
         return [{}] * len(points)
-    metres, degrees = place(torch.stack([*points])).tolist(), place.latitudes_longitudes(torch.stack([*points]))
+    stacked = torch.stack([*points])
+    metres, degrees = place(stacked).tolist(), place.latitudes_longitudes(stacked)
     return [
         {
             "crs": place.crs, "east_m": round(east, 2), "north_m": round(north, 2), "height_m": round(height, 2),
@@ -115,8 +116,8 @@ def middle(scene: SceneData, frame: Frame) -> Frame:
 
 @torch.no_grad()
 def look(module: pl.LightningModule, frame: Frame) -> Look:
-    """What the model shows in a frame, without what its camera adds, °C. It is that of the frame's camera as it is given, by
-    whose rays it is read."""
+    """What the model shows in a frame, without what its camera adds, °C: from the camera as it is given, not as the run learned
+    it, for ``Look`` finds places by that camera's rays."""
     output = module.render(frame, depth=True, camera=frame.camera)
     values = module.scene.thermal_range.to_celsius(output.features[..., 0].clamp(0, 1))
     return Look(frame.camera, surface_depth(output.depth, output.alpha[0]).cpu(), values.cpu())
@@ -154,8 +155,7 @@ def picture(
 def _marked(one: Look, shown: Sequence[tuple[str, tuple[float, float]]], low: float, high: float) -> np.ndarray:
     """The image of a look with names at some of its pixels (column, row)."""
     factor = max(1, round(ENLARGED / max(one.values.shape)))
-    image = np.repeat(np.repeat(colorize(one.values, low, high), factor, axis=0), factor, axis=1)
-    page = Image.fromarray(image)
+    page = Image.fromarray(enlarged(colorize(one.values, low, high), factor))
     draw = ImageDraw.Draw(page)
     for name, (column, row) in shown:
         x, y = column * factor, row * factor

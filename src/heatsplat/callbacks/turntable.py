@@ -9,8 +9,8 @@ from PIL import Image
 
 from heatsplat.callbacks.images import scene_bounds
 from heatsplat.io.pictures import Bar, compose, image_panel
-from heatsplat.io.quantities import moment
-from heatsplat.shots import clock_of, shot_frames
+from heatsplat.io.quantities import clock_of, moment
+from heatsplat.shots import shot_frames
 
 TURNTABLE_FILE = "renders/turntable.webp"
 QUALITY = 70  # of WebP, of 100

@@ -509,9 +509,8 @@ class Weathered:
         times, rate = self.weather.times_s, torch.tensor(rates_per_s, dtype=torch.float64)[:, None]
         # Of long waves and light the body takes what it takes; wind changes how soon it gives that to the air.
         driven = torch.cat([exchange[:, None] * drivers[:, :1], drivers[:, 1:]], 1)
-        driven = torch.cat(
-            [0.5 * (driven[1:] + driven[:-1]), torch.zeros_like(driven[1:, :1])], 1
-        )  # nothing drives the decay
+        # Nothing drives the decay.
+        driven = torch.cat([0.5 * (driven[1:] + driven[:-1]), torch.zeros_like(driven[1:, :1])], 1)
         given = rate * 0.5 * (exchange[1:] + exchange[:-1])
         keep = torch.exp(-given * times.diff())
         over = rate * (1.0 - keep) / given

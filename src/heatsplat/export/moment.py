@@ -56,10 +56,8 @@ class Moment:
     def look(self, frame: Frame) -> Look:
         """The values as the camera of a frame sees them; NaN where it sees no surface."""
         seen = self.seen
-        output = self.module.renderer(
-            seen.means, seen.quats, seen.scales, seen.opacities[None], self.blended[:, None], frame.camera, None, (1,),
-            depth=True,
-        )  # fmt: skip
+        shapes = seen.means, seen.quats, seen.scales, seen.opacities[None]
+        output = self.module.renderer.values_seen(shapes, self.blended[:, None], frame.camera, depth=True)
         alpha = output.alpha[0]
         means = (output.features[..., 0] / alpha).where(alpha >= OPEN, torch.nan)
         return Look(frame.camera, surface_depth(output.depth, alpha), self.of_blended(means))

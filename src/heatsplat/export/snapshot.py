@@ -97,7 +97,7 @@ class Snapshot:
 
 @torch.no_grad()
 def snapshot(module: Any) -> Snapshot:
-    """Takes one of a training module (``training.module.SplatTraining``) with its scene.
+    """Takes one of a training module (``training.scene_model.SceneModel``) with its scene.
 
     What the Gaussians send may depend on where it is seen from. Then it is the mean over training cameras, and
     ``left_out`` says over which, and how far single cameras are from it, at worst, too.

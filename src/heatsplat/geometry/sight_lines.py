@@ -8,9 +8,8 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera
 
-REACH = (
-    20  # a plane is fitted over the shorter side of the image / REACH to either side: depth maps of Gaussians are rough
-)
+# A plane is fitted over the shorter side of the image / REACH to either side: depth maps of Gaussians are rough.
+REACH = 20
 LEAST = 3  # pixels to either side, in small images
 BREAK = 0.05  # of 1 / depth, root mean square from that plane: what bends more has an edge in it
 

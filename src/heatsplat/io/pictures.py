@@ -39,7 +39,7 @@ BAR = 14
 ARROW = 9  # pixels of the triangle at an end of a bar beyond which there are values
 BLANK = 236  # grey of a cell without an image
 PANEL_HEIGHT = 260  # small images are enlarged by a whole factor to about this height
-MARKS = "os^Dv<>P"
+MARKS = "os^Dv<>P"  # of matplotlib, for many series in one figure
 TOLD_BEYOND = 0.05  # share of an image beyond an end of its bar from which the title says so
 FIGURE_PANEL = 1.8  # inches of height of an image in print
 
@@ -112,6 +112,11 @@ def _hatching(shape: tuple[int, ...]) -> np.ndarray:
     """Diagonal stripes, uint8 RGB [H, W, 3] (or [N, 1, 3] and the like), for pixels of which nothing is known."""
     stripes = sum(np.indices(shape)) // HATCH % 2
     return np.array(UNKNOWN, dtype=np.uint8)[stripes]
+
+
+def enlarged(image: np.ndarray, factor: int) -> np.ndarray:
+    """An image [H, W, 3] with squares of ``factor`` pixels a side in place of its pixels, [factor H, factor W, 3]."""
+    return np.repeat(np.repeat(image, factor, axis=0), factor, axis=1)
 
 
 def image_panel(image: Any, title: str, bar: Bar, thermal_range: ThermalRange | None = None) -> Panel:
@@ -281,8 +286,7 @@ def _row(panels: Sequence[Panel]) -> np.ndarray:
     x, y = 0, line
     for panel, marks, step in zip(panels, ticks, widths, strict=True):
         draw.text((x, 0), _fit(panel.title, step), font=_font(FONT), fill=INK)
-        image = np.repeat(np.repeat(panel.image, factor, axis=0), factor, axis=1)
-        page.paste(Image.fromarray(np.ascontiguousarray(image)), (x, y))
+        page.paste(Image.fromarray(np.ascontiguousarray(enlarged(panel.image, factor))), (x, y))
         if panel.text:
             draw.text((x + width / 2, y + height / 2), _fit(panel.text, width), font=_font(FONT), fill=INK, anchor="mm")
         if panel.bar:

@@ -1,4 +1,4 @@
-"""What people read in place of the name of a quantity: words and a unit."""
+"""What people read of quantities and moments: words and units in place of names, dates in place of seconds."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
+
+from heatsplat.contracts import SceneData
 
 # From how many seconds on which unit is read best.
 TIME_UNITS = ((3 * 86400.0, 86400.0, "d"), (3 * 3600.0, 3600.0, "h"), (300.0, 60.0, "min"), (-math.inf, 1.0, "s"))
@@ -80,6 +82,16 @@ class Clock:
         """What it shows at a time of the record, such as "2024-08-07 09:12 UTC"; with ``to`` "seconds", to these."""
         shown = datetime.fromtimestamp(self.at_zero_s + time_s, UTC).replace(tzinfo=None)
         return f"{shown.isoformat(' ', to)} {self.zone}".rstrip()
+
+
+def clock_of(scene: SceneData) -> Clock | None:
+    """The clock of a scene's record: that of the weather, or of the camera (``notes["clock_at_zero_s"]``); None where none is
+    known."""
+    if scene.weather is not None:
+        known = scene.weather.notes.get("utc_at_zero_s")
+        return None if known is None else Clock(known)
+    known = scene.notes.get("clock_at_zero_s")
+    return None if known is None else Clock(known, zone="")
 
 
 def moment(time_s: float, clock: Clock | None = None) -> str:

@@ -30,7 +30,7 @@ class RunResults:
 
     Args:
         run: what was run: method, scene, seed, steps and the like.
-        test: scores on the test views, named as in ``heatsplat.metrics.DEFINITIONS``.
+        test: scores on the test views, named as in ``heatsplat.metrics.definitions``.
         cost: what the run took: seconds, steps and frames per second, memory in MB (10^6 bytes), number of Gaussians.
         effects: which physical effects were simulated, each with its settings.
         data: what the loader found and assumed.

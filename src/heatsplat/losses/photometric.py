@@ -62,10 +62,8 @@ def ssim_map(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> 
     taps = window(prediction.dtype, prediction.device).expand(channels, 1, 1, WINDOW)
     blurred = functional.conv2d(torch.cat((x, y, x * x, y * y, x * y, beyond)), taps, groups=channels)
     blurred = functional.conv2d(blurred, taps.transpose(2, 3), groups=channels)
-    x_mean, y_mean, xx, yy, xy, outside = blurred.permute(
-        0, 2, 3, 1
-    )  # outside: share of the window that does not count
-
+    # outside: share of the window that does not count.
+    x_mean, y_mean, xx, yy, xy, outside = blurred.permute(0, 2, 3, 1)
     x_mean, y_mean = x_mean - x_shift * outside, y_mean - y_shift * outside
     x_variance = xx + x_shift**2 * outside - x_mean**2
     y_variance = yy + y_shift**2 * outside - y_mean**2

@@ -323,9 +323,8 @@ def _of_method(points: Sequence[Point], method: str, grows: bool, free_decay: bo
         others: dict[float, set[tuple[Any, ...]]] = {}
         for point in own:
             others.setdefault(point.growth, set()).add(point.choice[1:])
-        alike = min(
-            others, key=lambda growth: (-len(others[growth]), growth)
-        )  # so that choices differ in the rest alone
+        # One growth of all, so that choices differ in the rest alone.
+        alike = min(others, key=lambda growth: (-len(others[growth]), growth))
         own = [point for point in own if point.growth == alike]
         reasons.append("this method adds no Gaussians, so their number was not chosen")
     return own, reasons

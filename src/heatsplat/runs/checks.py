@@ -18,12 +18,8 @@ from heatsplat.runs.budget import seconds_of
 from heatsplat.runs.declared import check_declared
 from heatsplat.runs.device import device_of
 
-RATES = (
-    "means",
-    "log_scales",
-    "quats",
-    "opacity_logits",
-)  # learning rates in the group "optim"; elsewhere they are lr, lr_*
+# Learning rates in the group "optim"; elsewhere they are lr, lr_*.
+RATES = ("means", "log_scales", "quats", "opacity_logits")
 WEIGHTS = ("weight", "_l2", "_penalty")  # endings of the names of weights; "weights" holds more of them
 MAX_THREADS_PER_CORE = 4  # more only wait for each other
 

@@ -85,9 +85,9 @@ def all_rows(overrides: Iterable[str], **found: Iterable[Any]) -> str:
         overrides: of all of them.
         found: key -> its values in their results; they take the place of overrides of this key, and None tells nothing.
     """
-    told = {key: sorted({value for value in values if value is not None}) for key, values in found.items()}
-    kept = [text for text in overrides if not told.get(key_of(text))]
-    words = [*kept, *(f"{key}={','.join(map(str, values))}" for key, values in told.items() if values)]
+    known = {key: sorted({value for value in values if value is not None}) for key, values in found.items()}
+    kept = [text for text in overrides if not known.get(key_of(text))]
+    words = [*kept, *(f"{key}={','.join(map(str, values))}" for key, values in known.items() if values)]
     return f"All rows: `{' '.join(words)}`."
 
 

@@ -16,8 +16,8 @@ from heatsplat.contracts import SceneError
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 from heatsplat.studies.recorded import CONFIG, OVERRIDES, config_of, overrides_of
 
-# Overrides that make no other recipe. cli.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of folders,
-# are among them; the method is named by itself.
+# Overrides that make no other recipe. runs.resume.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of
+# folders, are among them; the method is named by itself.
 SEEDS = {"seed", "data.seed", "data.scene_seed"}
 PLACES = {"data", "data.root", "data.scene", "data.scenes"}
 NAMES = {"method", "row", "ablation", "experiment"}

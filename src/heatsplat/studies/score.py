@@ -58,7 +58,7 @@ def score_scene(handed_in: Path, scene: Path, truth: Path, scores: Sequence[str]
         handed_in: folder with a file <view>.tiff or <view>.npy for every held-out view.
         scene: what was handed out of it, for the bounds of its camera.
         truth: its exact images.
-        scores: names in ``heatsplat.metrics.DEFINITIONS``.
+        scores: names in ``heatsplat.metrics.definitions.DEFINITIONS``.
 
     Raises:
         SceneError: views are missing, or a file is no image of temperatures in °C of the right size.
@@ -158,7 +158,7 @@ def score_submission(folder: Path, root: Path, scores: Sequence[str]) -> tuple[d
     Args:
         folder: with metrics.json and a folder of renders for each scene that it names.
         root: folder of the protocol's scenes/ and truth/.
-        scores: names in ``heatsplat.metrics.DEFINITIONS``.
+        scores: names in ``heatsplat.metrics.definitions.DEFINITIONS``.
 
     Raises:
         SceneError: it names a scene that there is not, or ``read_submission`` or ``score_scene`` does.

@@ -14,14 +14,14 @@ from torch import Tensor
 from torch.nn import functional
 from tqdm import tqdm
 
-from heatsplat.contracts import SceneError, check_numbers
+from heatsplat.contracts import SceneError, check_count, check_numbers
 from heatsplat.geometry.resampling import resampled
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import Panel, colorize, compose, write_png
 from heatsplat.io.tables import markdown_table
 from heatsplat.losses.swinir import SwinIR
 from heatsplat.metrics.psnr import psnr
-from heatsplat.studies.options import check_count, non_empty
+from heatsplat.studies.options import non_empty
 from heatsplat.training.rng import generator_for
 
 log = logging.getLogger("heatsplat")

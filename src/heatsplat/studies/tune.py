@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError, check_numbers, check_option, is_number
+from heatsplat.contracts import SceneError, check_count, check_numbers, check_option, is_number
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import RunResults
 from heatsplat.io.tables import markdown_table, number, over_seeds, write_csv
 from heatsplat.metrics.definitions import DEFINITIONS, described
 from heatsplat.studies.child_runs import OtherSettingsError, all_rows, spelled, train_or_read
 from heatsplat.studies.finished import reason_of
-from heatsplat.studies.options import check_count, listed, whole_numbers
+from heatsplat.studies.options import listed, whole_numbers
 
 log = logging.getLogger("heatsplat")
 

@@ -196,9 +196,7 @@ class AtmosphericField(Wrapper):
             return None
         moment = query.frame_id if self.by_index else query.time_s
         if self.by_index and (moment is None or not 0 <= moment <= self.clock.span_s):
-            fraction = (
-                0.5  # a view that no one took has no index of its own: it is shown as at the middle of the record
-            )
+            fraction = 0.5  # a view that no one took has no index: it is shown as at the middle of the record
         else:
             fraction = self.clock.within(moment)
         when = torch.tensor([[fraction]], dtype=torch.float64, device=self.start.device)

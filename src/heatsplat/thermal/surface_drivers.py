@@ -56,9 +56,8 @@ def drivers_of(
         _surroundings(weather, options, up),
         _sky(weather, options, reference_k, up),
         _wind(weather, options, mean_wind),
-        _rain(
-            weather, options, reference_k
-        ),  # last: its air replaces that of the record, for wet surfaces but not for the sky
+        # Last: its air replaces that of the record, for wet surfaces but not for the sky.
+        _rain(weather, options, reference_k),
     )
     drivers: dict[str, Any] = {}
     effects: dict[str, dict[str, Any]] = {}

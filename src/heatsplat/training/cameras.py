@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numbers
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_count, check_numbers
 from heatsplat.same_bits import mean
 
 FEWEST = 3  # images: of two, the common movement of all leaves nothing to learn
@@ -47,7 +48,7 @@ class Cameras(nn.Module):
         """Terms of the loss by name."""
         return {}
 
-    def found(self) -> dict[str, Any] | None:
+    def learned(self) -> dict[str, Any] | None:
         """What was learned, for metrics.json; None for nothing."""
         return None
 
@@ -86,8 +87,7 @@ class RefinedCameras(Cameras):
         self, start: float = 0.1, weight: float = 1e-3, lr: float = 5e-3, lr_end: float = 0.01, align_steps: int = 0
     ) -> None:
         super().__init__()
-        if not isinstance(align_steps, int) or align_steps < 0:
-            raise ValueError(f"cameras need align_steps of 0 or more, a whole number, got {align_steps}")
+        check_count("cameras.align_steps", align_steps, least=0)
         for name, value in (("start", start), ("weight", weight), ("lr", lr), ("lr_end", lr_end)):
             check_numbers(name, value)
         if not 0 <= start < 1 or weight < 0 or lr < 0:
@@ -96,15 +96,11 @@ class RefinedCameras(Cameras):
             )
         self.start, self.weight, self.lr, self.lr_end, self.align_steps = start, weight, lr, lr_end, align_steps
         self.moves = nn.Parameter(torch.zeros(0, 6))
-        self.register_buffer(
-            "frame_ids", torch.zeros(0, dtype=torch.int64)
-        )  # of the training images, in the order of moves
-        self.register_buffer(
-            "pixels", torch.zeros(0, 2, dtype=torch.float64)
-        )  # radians, and world units, that are one there
-        self.register_buffer(
-            "common", torch.zeros(0, 0), persistent=False
-        )  # what all may do together, rows of unit length
+        # Of the training images, in the order of ``moves``: their ids, and the radians and world units that are a pixel there.
+        self.register_buffer("frame_ids", torch.zeros(0, dtype=torch.int64))
+        self.register_buffer("pixels", torch.zeros(0, 2, dtype=torch.float64))
+        # What all cameras may do together (``_common``).
+        self.register_buffer("common", torch.zeros(0, 0), persistent=False)
         self._known: dict[int, tuple[int, float, float]] = {}  # by frame: its row, and what a pixel is, on the CPU
         self.register_load_state_dict_post_hook(lambda cameras, _: cameras._look_up())
 
@@ -117,9 +113,8 @@ class RefinedCameras(Cameras):
             )
         focals = torch.tensor([_focal(frame.camera) for frame in frames], dtype=torch.float64)
         self.frame_ids = torch.tensor([frame.frame_id for frame in frames])
-        self.pixels = (
-            torch.stack([torch.ones_like(focals), torch.tensor(seen_depths(scene)).to(focals)], 1) / focals[:, None]
-        )
+        depths = torch.tensor(seen_depths(scene)).to(focals)
+        self.pixels = torch.stack([torch.ones_like(focals), depths], 1) / focals[:, None]
         self.moves = nn.Parameter(torch.zeros(len(frames), 6))
         centres = torch.stack([frame.camera.center for frame in frames])
         self.common = _common(centres - centres.mean(0), self.pixels).float()
@@ -147,7 +142,7 @@ class RefinedCameras(Cameras):
         return {"cameras": self.weight * 6 * mean(self.moves.square())} if self.weight > 0 else {}
 
     @torch.no_grad()
-    def found(self) -> dict[str, Any]:
+    def learned(self) -> dict[str, Any]:
         """Root mean squares over the images: of turns and offsets in pixels, of turns in degrees, of offsets in world units."""
         turns, offsets = self.moves.cpu().double().view(-1, 2, 3).unbind(1)
         pixels = self.pixels.cpu()
@@ -187,9 +182,11 @@ def seen_depths(scene: SceneData) -> list[float]:
         pixels, z = camera.project(scene.points.double())
         size = pixels.new_tensor([camera.width, camera.height])
         seen = z[(z > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)]
-        depths.append(float(seen.median()) if len(seen) else float("nan"))
-    known = torch.tensor(depths).nanmedian().item()
-    return [depth if depth == depth else known if known == known else scene.extent for depth in depths]
+        depths.append(float(seen.median()) if len(seen) else math.nan)
+    usual = torch.tensor(depths).nanmedian().item()
+    if math.isnan(usual):
+        usual = scene.extent
+    return [usual if math.isnan(depth) else depth for depth in depths]
 
 
 def _focal(camera: Camera) -> float:
@@ -215,8 +212,10 @@ def _common(centres: Tensor, pixels: Tensor) -> Tensor:
     rows = torch.stack(
         [torch.cat([turns / pixels[:, :1], moves / pixels[:, 1:]], 1).flatten() for turns, moves in ways]
     )
-    _, sizes, found = torch.linalg.svd(rows / rows.norm(dim=1, keepdim=True).clamp_min(1e-300), full_matrices=False)
-    return found[sizes > 1e-6]
+    _, sizes, independent = torch.linalg.svd(
+        rows / rows.norm(dim=1, keepdim=True).clamp_min(1e-300), full_matrices=False
+    )
+    return independent[sizes > 1e-6]
 
 
 def _moved(camera: Camera, moves: Tensor, per_turn: float, per_offset: float) -> Camera:

@@ -86,11 +86,11 @@ class Exposure:
         weights = weights / weights.sum(1, keepdim=True)
 
         def mean(shares: Tensor) -> Tensor:
-            found = means.new_empty(len(means), *shares.shape[1:])
-            parts = (rows.split(TOGETHER) for rows in (found, weights, torch.from_numpy(nearest)))
-            for place, some, ids in zip(*parts, strict=True):
-                place.copy_(torch.einsum("nk,nk...->n...", some, shares[ids]))
-            return found
+            result = means.new_empty(len(means), *shares.shape[1:])
+            parts = (rows.split(TOGETHER) for rows in (result, weights, torch.from_numpy(nearest)))
+            for means_of_part, weights_of_part, ids in zip(*parts, strict=True):
+                means_of_part.copy_(torch.einsum("nk,nk...->n...", weights_of_part, shares[ids]))
+            return result
 
         return {name: mean(shares) for name, shares in self._shares.items()}
 

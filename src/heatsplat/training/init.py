@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +14,12 @@ from heatsplat.contracts import SceneData, SceneError, evenly_spread
 from heatsplat.geometry.neighbours import neighbour_distances
 from heatsplat.geometry.voxels import cells, middles, spacing
 from heatsplat.io.ply import read_splats
-from heatsplat.physics.units import kelvin
+from heatsplat.physics.units import celsius
 from heatsplat.splats import ANCHORS, GAUSSIANS, GEOMETRY, NOTHING, Splats
 from heatsplat.thermal.base import PerGaussian, Seeds, ThermalModel
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.rng import generator_for
-from heatsplat.training.trained_frames import moved
+from heatsplat.training.trained_frames import camera_movement
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +28,8 @@ MIN_SQUARED_DISTANCE = 1e-7
 LONE_SIZE = 0.1  # semi-axis in extents of a Gaussian that is the only one and has no neighbours
 ABSENT = -30.0  # logit of an opacity of 1e-13: what no renderer shows and no gradient reaches
 SAMPLED_VIEWS = 64  # image values at the points come from this many views at most, evenly spread
+# What a point cloud may hold beside the geometry, in words (``read_splats``).
+APPEARANCE = {"values": "colours", "sh_rest": "spherical harmonics", "temperature_k": "temperatures"}
 
 
 class Start(ABC):
@@ -192,32 +193,20 @@ class Pretrained(Start):
             raise SceneError(
                 f"init.path={self.path}: there is no such file (a run that started from one needs it again)"
             )
-        held: dict[str, Tensor] = {}
         if self.path.suffix == ".ply":
-            geometry, held, rows = _splats_of_file(self.path)
+            geometry, appearance = _splats_of_file(self.path)
         else:
-            geometry, rows = _splats_of_checkpoint(self.path, scene)
-        if rows not in (GAUSSIANS, thermal.rows):
-            other = (
-                "a field without Gaussians" if rows == NOTHING else "anchors, whose Gaussians are made for each view"
-            )
-            raise SceneError(
-                f"init.path={self.path} holds {other}: give a .ply, or the checkpoint of a method of Gaussians such as 3dgs"
-            )
+            geometry, appearance = _geometry_of_checkpoint(self.path, scene, thermal), {}
         wanted = len(thermal.opacity_channels)
         if geometry["opacity_logits"].shape[1] != wanted:  # of another number of modalities: all start from the first
             geometry["opacity_logits"] = geometry["opacity_logits"][:, :1].repeat(1, wanted)
         log.info("%d Gaussians from %s", len(geometry["means"]), self.path)
-        source, values = _start_held(held, scene, thermal)
+        values = _take_values(appearance, scene, thermal)
         splats, declared = with_heat(geometry, scene, thermal, seed, values)
-        taken = {source}
-        if source == "values" and "sh_rest" in held and _takes_harmonics(splats, held["sh_rest"]):
-            taken.add("sh_rest")
-        names = {"values": "colours", "sh_rest": "spherical harmonics", "temperature_k": "temperatures"}
-        if left := [word for name, word in names.items() if name in held and name not in taken]:
-            log.info(
-                "init.path: %s of the file are not taken: they are not what this model starts from", ", ".join(left)
-            )
+        _take_harmonics(appearance, splats)
+        if appearance:
+            left = ", ".join(APPEARANCE[name] for name in appearance)
+            log.info("init.path: %s of the file are not taken: they are not what this model starts from", left)
         return splats, declared
 
 
@@ -241,27 +230,27 @@ def _separate(geometry: dict[str, Tensor]) -> dict[str, Tensor]:
     return several | {"opacity_logits": several["opacity_logits"].where(own, ABSENT)}
 
 
-def _start_held(
-    held: Mapping[str, Tensor], scene: SceneData, thermal: ThermalModel
-) -> tuple[str | None, Tensor | None]:
-    """What of a file a model starts from, and the image values [N, C] that it is: colours as of visible images, temperatures in
-    the scene's bounds; None where it holds neither for this model."""
+def _take_values(appearance: dict[str, Tensor], scene: SceneData, thermal: ThermalModel) -> Tensor | None:
+    """Image values [N, C] that a model starts from, taken out of what a file holds: its colours for a model of visible images,
+    its temperatures in the scene's bounds for one of temperatures; None where it holds neither for this model."""
     images, bounds = (thermal.modality, thermal.modality_channels), scene.range_of(thermal.modality)
-    if images == ("rgb", (3,)) and "values" in held:
-        return "values", held["values"]
-    if images == ("thermal", (1,)) and bounds is not None and "temperature_k" in held:
-        return "temperature_k", bounds.to_unit(held["temperature_k"] - kelvin(0.0))[:, None].clamp(0, 1)
-    return None, None
+    if images == ("rgb", (3,)):
+        return appearance.pop("values", None)
+    if images == ("thermal", (1,)) and bounds is not None and "temperature_k" in appearance:
+        return bounds.to_unit(celsius(appearance.pop("temperature_k")))[:, None].clamp(0, 1)
+    return None
 
 
 @torch.no_grad()
-def _takes_harmonics(splats: Splats, rest: Tensor) -> bool:
-    """Whether splats have harmonics of the direction of view, which then are ``rest`` [N, K, C], as many as both have."""
-    if "sh_rest" not in splats or splats["sh_rest"].shape[2] != rest.shape[2]:
-        return False
-    count = min(splats["sh_rest"].shape[1], rest.shape[1])
-    splats["sh_rest"][:, :count] = rest[:, :count]
-    return True
+def _take_harmonics(appearance: dict[str, Tensor], splats: Splats) -> None:
+    """Puts the harmonics that a file holds into splats that have such, as many as both have; only beside colours that were
+    taken (``_take_values``)."""
+    if "values" in appearance or "sh_rest" not in appearance or "sh_rest" not in splats:
+        return
+    rest, own = appearance["sh_rest"], splats["sh_rest"]
+    if rest.shape[2] == own.shape[2]:
+        count = min(rest.shape[1], own.shape[1])
+        own[:, :count] = appearance.pop("sh_rest")[:, :count]
 
 
 def with_heat(
@@ -297,8 +286,8 @@ def declared_by(thermal: ThermalModel, seeds: Seeds) -> dict[str, PerGaussian]:
             raise ValueError(f"{what} is of type {type(item).__name__}: give PerGaussian(initial, lr)")
         initial = item.initial
         if not isinstance(initial, Tensor) or not initial.is_floating_point() or initial.shape[:1] != (count,):
-            found = f"{initial.dtype} {list(initial.shape)}" if isinstance(initial, Tensor) else type(initial).__name__
-            raise ValueError(f"{what} must start from floats [{count}, ...], one row for each Gaussian, got {found}")
+            shown = f"{initial.dtype} {list(initial.shape)}" if isinstance(initial, Tensor) else type(initial).__name__
+            raise ValueError(f"{what} must start from floats [{count}, ...], one row for each Gaussian, got {shown}")
         if not bool(initial.isfinite().all()):
             raise ValueError(f"{what} starts from {int((~initial.isfinite()).sum())} values that are NaN or infinite")
         if not 0 <= item.lr < float("inf"):
@@ -312,17 +301,18 @@ def _times(scene: SceneData) -> Tensor | None:
     return None if None in times else torch.tensor(times, dtype=torch.float64)
 
 
-def _splats_of_file(path: Path) -> tuple[dict[str, Tensor], dict[str, Tensor], str]:
-    """Geometry of a point cloud, what else it holds (``read_splats``), and what its rows are: Gaussians."""
+def _splats_of_file(path: Path) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Geometry of a point cloud, and what else it holds (``APPEARANCE``)."""
     try:
-        found = {name: torch.from_numpy(values.copy()) for name, values in read_splats(path).items()}
+        tensors = {name: torch.from_numpy(values.copy()) for name, values in read_splats(path).items()}
     except ValueError as error:
         raise SceneError(f"init.path: {error}") from error
-    return {name: found.pop(name) for name in GEOMETRY}, found, GAUSSIANS
+    return {name: tensors.pop(name) for name in GEOMETRY}, tensors
 
 
-def _splats_of_checkpoint(path: Path, scene: SceneData) -> tuple[dict[str, Tensor], str]:
-    """Geometry of a checkpoint, and what its rows are; cameras of frames of the same names that moved are warned of."""
+def _geometry_of_checkpoint(path: Path, scene: SceneData, thermal: ThermalModel) -> dict[str, Tensor]:
+    """Geometry of a checkpoint, whose rows are Gaussians or what those of the model are; cameras of frames of the same names that
+    moved are warned of."""
     try:
         stored = load_checkpoint(path)
     except SceneError as error:
@@ -332,18 +322,23 @@ def _splats_of_checkpoint(path: Path, scene: SceneData) -> tuple[dict[str, Tenso
     if missing:
         raise SceneError(f"init.path={path} is no checkpoint of heatsplat: it holds no {', '.join(missing)} of splats")
     geometry = {name: tensors[f"splats.raw.{name}"] for name in GEOMETRY}
-    own = stored.get("heatsplat", {})
-    frames = own.get("scales", {}).get("frames")
-    if frames is not None and (
-        told := moved(frames, scene.train.frames)
-    ):  # those of another camera do, by its mounting
+    written = stored.get("heatsplat", {})
+    frames = written.get("scales", {}).get("frames")
+    movement = None if frames is None else camera_movement(frames, scene.train.frames)
+    if movement is not None:
+        # Frames of another camera have other places too, by its mounting.
         log.warning(
             "init.path=%s: %s: unless the frames are of another camera, its Gaussians are not in the world of this scene",
             path,
-            told,
+            movement,
         )
-    rows = own.get("rows", GAUSSIANS) if len(geometry["means"]) else NOTHING
-    return geometry, rows
+    rows = written.get("rows", GAUSSIANS) if len(geometry["means"]) else NOTHING
+    if rows not in (GAUSSIANS, thermal.rows):
+        kind = "a field without Gaussians" if rows == NOTHING else "anchors, whose Gaussians are made for each view"
+        raise SceneError(
+            f"init.path={path} holds {kind}: give a .ply, or the checkpoint of a method of Gaussians such as 3dgs"
+        )
+    return geometry
 
 
 def looks_at(scene: SceneData, points: Tensor, modality: str, channels: int) -> Tensor:

@@ -123,9 +123,7 @@ class SplatTraining(SceneModel):
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
         self._pixels = 0  # of the last image
-        self._compared = (
-            False  # whether the optimiser has all parameters, once the first step has made those that it makes
-        )
+        self._checked_trained = False  # after the first step, which may make parameters
         self._average = Average()
         self._waiting: dict[str, Any] = {}  # gradients of a checkpoint that was written between two updates
 
@@ -264,8 +262,8 @@ class SplatTraining(SceneModel):
             warn_of_untrained(plain(self.trainer.optimizers[0]), self.stages)
             if self._average:
                 self.results.run["averaged_updates"] = self._average.give(self._learned())
-            if (found := self.cameras.found()) is not None:
-                self.results.run["cameras"] = found
+            if (learned := self.cameras.learned()) is not None:
+                self.results.run["cameras"] = learned
 
     def on_train_epoch_end(self) -> None:
         """After the last step and its validation, before last.ckpt is written: what is merged is in it."""
@@ -289,9 +287,9 @@ class SplatTraining(SceneModel):
         maps = self.density.maps_at(here)
         drawn = generator_for(self.seed, step, "rays") if self.thermal.rows == NOTHING else None
         self.cameras.keep_apart()
-        stood = self.cameras.of(frame, progress)
+        taken_from = self.cameras.of(frame, progress)
         output = self.render(
-            frame, self.sensor.needs_depth, self.density.absgrad, maps, ratio, signs, generator=drawn, camera=stood
+            frame, self.sensor.needs_depth, self.density.absgrad, maps, ratio, signs, generator=drawn, camera=taken_from
         )
         image, *companions = self._images(output)
         prediction = self.sensor(image, frame, output.seen_depth)
@@ -307,8 +305,12 @@ class SplatTraining(SceneModel):
             ratio,
         )
         entropy = {} if signs is None else {"entropy": self.overlap.entropy(output)}
-        own = self.thermal.regularisers(self.splats), self.sensor.regularisers(), self.cameras.regularisers()
-        terms = summands(self.loss(inputs), *own, entropy)
+        regularisers = (
+            self.thermal.regularisers(self.splats),
+            self.sensor.regularisers(),
+            self.cameras.regularisers(),
+        )
+        terms = summands(self.loss(inputs), *regularisers, entropy)
         self._rendered = (output, camera)
         loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
@@ -350,8 +352,8 @@ class SplatTraining(SceneModel):
         update = self._updates(step)
         with self.stages.on_step(step, inner):
             optimizer.step(closure=optimizer_closure) if update else optimizer_closure()
-        if not self._compared:
-            self._compared = True
+        if not self._checked_trained:
+            self._checked_trained = True
             check_trained(self, inner)
         cloud = self.cloud(inner)
         here = self.schedule.round_step(step)

@@ -17,13 +17,13 @@ log = logging.getLogger(__name__)
 
 def check_registered(module: nn.Module) -> None:
     """Raises ValueError where a part of a run holds parameters in a list or dict of Python, of which torch knows nothing."""
-    known = {id(parameter) for parameter in module.parameters()}
-    for name, part in module.named_modules():
-        attributes = {} if part is module else vars(part)
-        for attribute, value in attributes.items():
+    registered = {id(parameter) for parameter in module.parameters()}
+    parts = [(name, part) for name, part in module.named_modules() if part is not module]
+    for name, part in parts:
+        for attribute, value in vars(part).items():
             if attribute.startswith("_") or not isinstance(value, list | tuple | dict):
                 continue
-            if any(id(parameter) not in known for parameter in _parameters_in(value)):
+            if any(id(parameter) not in registered for parameter in _parameters_in(value)):
                 raise ValueError(
                     f"{name}.{attribute} of {type(part).__name__} holds parameters in a {type(value).__name__}, where neither "
                     "the optimiser nor checkpoints find them: use nn.ParameterList, nn.ModuleList or the like"
@@ -32,19 +32,19 @@ def check_registered(module: nn.Module) -> None:
 
 def check_trained(module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
     """Raises ValueError where a module has parameters that its optimiser does not, as they were made after it."""
-    known = {id(parameter) for group in optimizer.param_groups for parameter in group["params"]}
-    late = [name for name, parameter in module.named_parameters() if id(parameter) not in known]
+    trained = {id(parameter) for group in optimizer.param_groups for parameter in group["params"]}
+    late = [name for name, parameter in module.named_parameters() if id(parameter) not in trained]
     if late:
         raise ValueError(
-            f"{', '.join(late)}: the optimiser does not know of this parameter, which would never learn. Create parameters of a "
-            "thermal model or a sensor part in __init__ or prepare, and those of each Gaussian in per_gaussian"
+            f"the optimiser does not know the parameters {', '.join(late)}, which would never learn: create those of a thermal "
+            "model or a sensor part in __init__ or prepare, and those of each Gaussian in per_gaussian"
         )
 
 
 def warn_of_untrained(optimizer: torch.optim.Optimizer, stages: Stages) -> None:
-    """Warns of parameters with a learning rate that never had a gradient, at the end of a run.
+    """Warns, at the end of a run, of parameters with a learning rate that never had a gradient: Adam has no state of these.
 
-    Adam keeps nothing of those. Not meant are the geometry, and what a stage froze.
+    The geometry is left out, and so is what a stage froze.
     """
     idle = [
         group["name"]

@@ -83,11 +83,12 @@ def on_scales(scene: SceneData, scales: Mapping[str, Any], *, exactly: bool = Fa
 
 def _since(scene: SceneData, zero_s: float) -> SceneData:
     """The scene with ``zero_s`` of its clock as its new second 0."""
-    truth = scene.truth
+    truth, clock_s = scene.truth, scene.notes.get("clock_at_zero_s")
     return replace(
         _mapped(scene, lambda view: replace(view, frame=replace(view.frame, time_s=_less(view.time_s, zero_s)))),
         weather=None if scene.weather is None else scene.weather.since(zero_s),
         truth=None if truth is None else lambda points, times_s: truth(points, times_s + zero_s),
+        notes=scene.notes if clock_s is None else {**scene.notes, "clock_at_zero_s": clock_s + zero_s},
     )
 
 

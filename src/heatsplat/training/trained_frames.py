@@ -58,51 +58,59 @@ def check_frames(before: Mapping[str, Any] | None, scene: SceneData, *, exactly:
         )
 
 
-def moved(before: Mapping[str, Any], frames: Iterable[Frame]) -> str | None:
-    """How far the cameras of those frames moved that a checkpoint tells of, in words; None where they did not."""
+def camera_movement(before: Mapping[str, Any], frames: Iterable[Frame]) -> str | None:
+    """How far the cameras of those frames moved that a checkpoint tells of, in words; None where they did not.
+
+    Args:
+        before: what it tells (``frames_of``).
+        frames: as they are now; those of other names do not count, and of several of one name the first does.
+    """
     rows = _rows(before["names"])
-    here = {frame.name: frame for frame in reversed([*frames]) if frame.name in rows}
-    if not here:
+    now = {frame.name: frame for frame in reversed([*frames]) if frame.name in rows}
+    if not now:
         return None
-    chosen = [rows[name] for name in here]
-    old, new = before["viewmats"][chosen], torch.stack([frame.camera.viewmat for frame in here.values()])
-    lenses = before["lenses"][chosen] - torch.stack([_lens(frame) for frame in here.values()])
-    way = (_centers(old) - _centers(new)).norm(dim=1)
+    in_both = [rows[name] for name in now]
+    old, new = before["viewmats"][in_both], torch.stack([frame.camera.viewmat for frame in now.values()])
+    distances = (_centers(old) - _centers(new)).norm(dim=1)
     turns = old[:, :3, :3] - new[:, :3, :3]  # its norm is 2 sqrt(2) sin(angle / 2)
     angles = 2 * (turns.norm(dim=(1, 2)) / math.sqrt(8)).clamp(max=1).asin()
     all_centers = _centers(before["viewmats"])
-    reach = (all_centers - all_centers.mean(0)).norm(dim=1).median().clamp_min(1e-9)
-    away = (way > MOVED * reach) | (angles > TURNED)
-    if bool(away.any()):
+    spread = (all_centers - all_centers.mean(0)).norm(dim=1).median().clamp_min(1e-9)
+    elsewhere = (distances > MOVED * spread) | (angles > TURNED)
+    if bool(elsewhere.any()):
         return (
-            f"the cameras of {int(away.sum())} of its {len(rows)} training frames moved by up to {float(way.max()):.3g} "
-            f"world units and {math.degrees(float(angles.max())):.3g} degrees"
+            f"the cameras of {int(elsewhere.sum())} of its {len(rows)} training frames moved by up to "
+            f"{float(distances.max()):.3g} world units and {math.degrees(float(angles.max())):.3g} degrees"
         )
-    other = (lenses.abs() > LENS).any(dim=1)
-    if bool(other.any()):
-        return f"{int(other.sum())} of its {len(rows)} training frames have another focal length or principal point"
+    lens_changes = before["lenses"][in_both] - torch.stack([_lens(frame) for frame in now.values()])
+    other_lens = (lens_changes.abs() > LENS).any(dim=1)
+    if bool(other_lens.any()):
+        return (
+            f"{int(other_lens.sum())} of its {len(rows)} training frames have another focal length or principal point"
+        )
     return None
 
 
 def _changes(before: Mapping[str, Any], scene: SceneData, exactly: bool) -> Iterator[str]:
+    """What changed, each in words (``check_frames``)."""
     names, train = before["names"], scene.train.frames
-    here = {frame.name: frame for frame in reversed(train if exactly else scene.frames)}  # training frames come first
+    now = {frame.name: frame for frame in reversed(train if exactly else scene.frames)}  # training frames come first
     known = {*names} if exactly else {*names, *before["held_out"]}
-    if gone := [name for name in names if name not in here]:
-        yield f"{_counted(gone)} less"
-    if more := [frame.name for frame in train if frame.name not in known]:
-        yield f"{_counted(more)} more"
-    if told := moved(before, here.values()):
-        yield told
-    kept = [(row, here[name]) for name, row in _rows(names).items() if name in here]
-    if not kept:
+    if missing := [name for name in names if name not in now]:
+        yield f"{_counted(missing)} less"
+    if added := [frame.name for frame in train if frame.name not in known]:
+        yield f"{_counted(added)} more"
+    if movement := camera_movement(before, now.values()):
+        yield movement
+    in_both = [(row, now[name]) for name, row in _rows(names).items() if name in now]
+    if not in_both:
         return
-    times = before["times_s"][[row for row, _ in kept]] - _times([frame for _, frame in kept])
-    later = times.abs().nan_to_num(0.0)
-    if float(later.max()) > LATER_S:
-        yield f"times of {int((later > LATER_S).sum())} training frames differ by up to {float(later.max()):.6g} s"
-    ids = [before["frame_ids"][row] for row, _ in kept]
-    if exactly and not gone and not more and ids != [frame.frame_id for _, frame in kept]:
+    shifts = before["times_s"][[row for row, _ in in_both]] - _times([frame for _, frame in in_both])
+    shifts = shifts.abs().nan_to_num(0.0)
+    if float(shifts.max()) > LATER_S:
+        yield f"times of {int((shifts > LATER_S).sum())} training frames differ by up to {float(shifts.max()):.6g} s"
+    ids = [before["frame_ids"][row] for row, _ in in_both]
+    if exactly and not missing and not added and ids != [frame.frame_id for _, frame in in_both]:
         yield "its frames are numbered in another way, as by test frames that were added or removed"
 
 

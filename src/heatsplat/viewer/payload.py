@@ -14,7 +14,7 @@ from heatsplat.contracts import Frame, SceneData, evenly_spread
 from heatsplat.export.basis import steps_of
 from heatsplat.export.snapshot import TOLERANCE_C, TOLERANCE_UNIT, Layer, Snapshot
 from heatsplat.io.pictures import lut
-from heatsplat.io.quantities import words_and_unit
+from heatsplat.io.quantities import clock_of, words_and_unit
 
 COLORMAPS = ("inferno", "viridis", "turbo", "cividis", "gray", "RdBu_r")  # the last one is for differences
 THUMBNAIL = 144  # pixels of the longer side of an image
@@ -119,8 +119,8 @@ def _moments(scene: SceneData) -> list[tuple[str, float]]:
 def _clock(scene: SceneData) -> dict[str, Any]:
     """The moment of second 0 in seconds since 1970, None where no clock tells it, and whether that is known to be UTC: a camera's
     own clock may count in any zone."""
-    utc = scene.weather.notes.get("utc_at_zero_s") if scene.weather else None
-    return {"start": scene.notes.get("clock_at_zero_s") if utc is None else utc, "utc": utc is not None}
+    clock = clock_of(scene)
+    return {"start": None, "utc": False} if clock is None else {"start": clock.at_zero_s, "utc": clock.zone == "UTC"}
 
 
 def _layer(layer: Layer, block: Block) -> dict[str, Any]:

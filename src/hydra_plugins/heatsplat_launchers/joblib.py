@@ -47,7 +47,8 @@ def end_with(launcher: int) -> None:
         while os.getppid() == launcher:
             time.sleep(1.0)
         end = time.monotonic() + GRACE_S
-        while time.monotonic() < end:  # the first stops the job after its step (cli.stoppable), the last this process
+        # The first signal stops the job after its step (runs.signals.stoppable), the last this process.
+        while time.monotonic() < end:
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(1.0)
         os._exit(1)

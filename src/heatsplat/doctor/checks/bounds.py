@@ -78,8 +78,8 @@ def _of_unit(material: Material, values: torch.Tensor) -> list[Finding]:
         "data.raw_offset_c."
     )
     if KELVIN_C[0] <= low and high <= KELVIN_C[1]:
-        what = f"All pixels lie within {low:.4g} .. {high:.4g} °C, which may be kelvin of"
-        what = f"{what} {low - KELVIN_AT_0_C:.4g} .. {high - KELVIN_AT_0_C:.4g} °C."
+        kelvin = f"kelvin of {low - KELVIN_AT_0_C:.4g} .. {high - KELVIN_AT_0_C:.4g} °C"
+        what = f"All pixels lie within {low:.4g} .. {high:.4g} °C, which may be {kelvin}."
         return [Finding("bounds", 0.9, what, remedy)]
     if material.bounds_c is None:  # a cold sky or a flame may be in view, but no scene consists of them
         low, high = float(values.median()), float(values.median())

@@ -39,14 +39,15 @@ def find(material: Material) -> list[Finding]:
 
 def _without_camera(material: Material) -> list[Finding]:
     """Images that the model has no camera for, where they are more than a few."""
-    lost, of = material.without_camera
-    if lost <= FEW * of:
+    lost, images = material.without_camera
+    if lost <= FEW * images:
         return []
     return [
         Finding(
             "views",
-            0.3 * lost / of,
-            f"The model has no camera for {lost} of {of} images, which are left out of training: what only they show is missing.",
+            0.3 * lost / images,
+            f"The model has no camera for {lost} of {images} images, which are left out of training: what only they show is "
+            "missing.",
             "Record more overlap between the groups that do not connect, or find cameras by photos beside (poses=rgb); the "
             "report of a preparation says why each has none.",
         )

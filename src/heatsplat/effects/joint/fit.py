@@ -203,9 +203,8 @@ class Fit:
         terms = {name: self.data.effects[name].term for name in columns}
         added = {name: block @ terms[name].settled(numbers[name]) for name, block in columns.items()}
         for gain in (name for name in columns if terms[name].gain):
-            for name in (
-                added.keys() & known.keys()
-            ):  # what all images gain alike of what earlier effects added is theirs
+            # What all images gain alike of what earlier effects added is theirs.
+            for name in added.keys() & known.keys():
                 if terms[name].order < terms[gain].order:
                     added[name] = added[name] + numbers[gain].mean() * known[name]
         return added

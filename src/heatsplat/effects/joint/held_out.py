@@ -71,9 +71,8 @@ def shuffled(fit: Fit, less: Model, generator: torch.Generator, together: bool) 
     points, frames = fit.weights.shape
     left, unseen = fit.residuals(less), (fit.weights <= 0) * 2.0
     keys = torch.rand(1 if together else points, frames, generator=generator, dtype=torch.float64).expand(points, -1)
-    there = (torch.arange(frames) / frames + unseen).argsort(
-        1
-    )  # the images that see a point, in order; then the others
+    # The images that see a point, in order; then the others.
+    there = (torch.arange(frames) / frames + unseen).argsort(1)
     order = (keys + unseen).argsort(1)  # the same, shuffled
     moved = torch.zeros_like(left).scatter(1, there, (left / fit.errors).gather(1, order)) * fit.errors
     values = fit.data.tracks.values - left + torch.where(fit.weights > 0, moved, left)

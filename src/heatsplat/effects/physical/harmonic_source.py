@@ -90,9 +90,8 @@ EFFECT = Effect(
         "state", "newton_harmonic", {"frequencies": 0}, "source", {HARMONIC: "newton_harmonic", COMMON: "common_source"}
     ),
     term=Own(
-        basis=lambda fit, count: common_courses(
-            fit, Model.of(relaxation=1), count
-        ),  # by which they depart from relaxation
+        # By which they depart from relaxation.
+        basis=lambda fit, count: common_courses(fit, Model.of(relaxation=1), count),
         in_time=True,
         kinds=kinds,
         numbers=lambda data, count: count * data.frames,

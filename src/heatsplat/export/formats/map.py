@@ -20,7 +20,7 @@ from heatsplat.export.place import AUTO, Place, place_of
 from heatsplat.export.seams import comparison, mosaic, shift_between, smoothed
 from heatsplat.geometry.coverage import OPEN, covered, gap_free, seen_means, surface_depth
 from heatsplat.geometry.looks import surface_points
-from heatsplat.io.pictures import Bar, Panel, bounds_of, colorize, compose, lettering, write_png
+from heatsplat.io.pictures import Bar, Panel, bounds_of, colorize, compose, enlarged, lettering, write_png
 from heatsplat.io.quantities import moment as said
 from heatsplat.shots import at_time, checked_unseen, deviations_told, first_free_id, sightings
 from heatsplat.uncertainty import Uncertainty
@@ -132,10 +132,10 @@ class Map(Format):
             return
         _say_shift(other, own, pixel, place.unit, unit, self.against)
         recorded, owner = mosaic(scene, surface_points(camera, smoothed(depth)))
-        one, this = other.method, _method(moment)
+        before, now = other.method, _method(moment)
         if other.scene != scene.name:
-            one, this = f"{one}, {other.scene}", f"{this}, {scene.name}"
-        names = ("images", one, this if one != this else f"{this}, this run")
+            before, now = f"{before}, {other.scene}", f"{now}, {scene.name}"
+        names = ("images", before, now if now != before else f"{now}, this run")
         maps = dict(zip(names, (recorded, other.values, own), strict=True))
         spread = next((band for title, band in bands.items() if title.startswith(DEVIATION)), None)
         write_png(path.with_suffix(".png"), comparison(maps, owner, unit, spread))
@@ -242,7 +242,7 @@ def _say_shift(other: _Other, own: np.ndarray, pixel: float, unit: str, values: 
     (log.warning if moved else log.info)(
         "what.against=%s lies %.3g %s to the east and %.3g to the north of this map, by how they correlate (%.3f there, %.3f as "
         "they lie)%s",
-        path, columns * pixel, unit, (0 - rows) * pixel, there, here, "; a difference of the two shows that shift" * moved,
+        path, columns * pixel, unit, -rows * pixel, there, here, "; a difference of the two shows that shift" * moved,
     )  # fmt: skip
     log.info("what.against is %.2f %s warmer than this map in the median, which their difference holds", level, values)
 
@@ -254,7 +254,7 @@ def _picture(values: np.ndarray, moment: Moment, place: Place, pixel: float) -> 
     step = -(-max(values.shape) // SHOWN)
     image = colorize(values[::step, ::step], low, high)
     factor = max(1, SHOWN // (2 * max(image.shape)))
-    page = Image.fromarray(np.repeat(np.repeat(image, factor, axis=0), factor, axis=1))
+    page = Image.fromarray(enlarged(image, factor))
     a_pixel = pixel * step / factor
     length = 10.0 ** np.floor(np.log10(0.5 * page.width * a_pixel))
     end = MARGIN_PX + length / a_pixel

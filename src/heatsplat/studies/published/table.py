@@ -61,7 +61,7 @@ class Table(SweepPlan):
         return [*map(list, first), *jobs], len(first)
 
     def write(self, folder: Path) -> list[Path]:
-        """The table of the runs, and that beside the paper's figures, which is told, too."""
+        """The table of the runs, and that beside the paper's figures, which is logged, too."""
         if self.dry:
             return []
         runs_alone = write_sweep(folder)

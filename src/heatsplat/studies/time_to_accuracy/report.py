@@ -79,11 +79,8 @@ def times(panel: Panel, way: str) -> list[str]:
     scores = _scores(panel)
     head = ["recipe"]
     for score in scores:
-        head += [
-            f"to its {DEFINITIONS[score].title} (s)",
-            "of the standard's time to it",
-            "of the reference's whole time",
-        ]
+        title = DEFINITIONS[score].title
+        head += [f"to its {title} (s)", "of the standard's time to it", "of the reference's whole time"]
     rows = []
     for own in panel.groups():
         measures = [panel.measures(one) for one in own]
@@ -132,9 +129,8 @@ def picture(panels: Sequence[Panel], clock: str) -> Figure:
     counts as good as it (means over the seeds).
     """
     names = sorted({one.recipe for panel in panels for one in panel.outcomes if one.recipe is not None})
-    looks = {name: series_look(i + 10) for i, name in enumerate(names)} | {
-        None: ("black", "o")
-    }  # circles: the standard's
+    looks = {name: series_look(i + 10) for i, name in enumerate(names)}  # without circles, which are the standard's
+    looks[None] = ("black", "o")
     figure = Figure(figsize=(11, 4.4 * len(panels)), dpi=110, layout="constrained")
     for i, panel in enumerate(panels):
         scores = _scores(panel)

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from heatsplat.contracts import SceneError, check_option
+from heatsplat.contracts import SceneError, check_count, check_option
 from heatsplat.io.command_lines import as_dict
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
@@ -21,7 +21,7 @@ from heatsplat.io.tables import write_csv
 from heatsplat.studies.child_runs import train_or_read
 from heatsplat.studies.finished import settings_of
 from heatsplat.studies.frontier.runs import find_runs
-from heatsplat.studies.options import check_count, listed, non_empty
+from heatsplat.studies.options import listed, non_empty
 from heatsplat.studies.time_to_accuracy.report import markdown, picture, records
 from heatsplat.studies.time_to_accuracy.runs import Panel, panels_of, without_length
 

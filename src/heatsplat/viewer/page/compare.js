@@ -1,6 +1,8 @@
 // A second run beside the first, from a page of its own.
 
 const SAME_MOMENT_S = 1e-3, SAME_PLACE = 0.02;  // of the size of the scene
+const OTHER_DAY = "The second run was recorded at another time";
+const OTHER_CLOCK = "Images do not tell how far the clocks of both runs are apart: each counts from its own first training image.";
 
 // Whether both pages know the moment of their second 0, on the same kind of clock.
 const shareClock = (own, told) => typeof own.start === "number" && typeof told.start === "number" && own.utc === told.utc;
@@ -63,7 +65,6 @@ class SecondRun {
     const { span } = this.told, later = own.span && span ? laterIn(own, this.told) : 0;
     const apart = later !== null && span && own.span && (own.span[1] + later < span[0] || own.span[0] + later > span[1]);
     this.later = apart ? 0 : later ?? 0;
-    this.ownClock = later === null || Boolean(apart);
     this.clockNote = later === null ? OTHER_CLOCK : apart ? `${OTHER_DAY} (${daysAndHours(-later)}): each run counts from its own first training image.` : "";
   }
 

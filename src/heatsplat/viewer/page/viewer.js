@@ -2,8 +2,6 @@
 
 const $ = (id) => document.getElementById(id);
 const AT_CAMERAS = "Images of cameras are known where and when they were taken: N and P go to the next.";
-const OTHER_DAY = "The second run was recorded at another time";
-const OTHER_CLOCK = "Images do not tell how far the clocks of both runs are apart: each counts from its own first training image.";
 const BINS = 96, PLAY_LIMIT_MS = 45, DIFFERENCES = "RdBu_r";
 
 class Viewer {
