@@ -15,8 +15,9 @@ from heatsplat.physics.ellipsoids import convecting_area_ratio, projected_area_r
 from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, Seeds
-from heatsplat.thermal.energy_network import LIMITS, TERMS, EnergyNetwork
+from heatsplat.thermal.energy_network import LIMITS, EnergyNetwork
 from heatsplat.thermal.land_cover import ATTRIBUTES, TABLE, typical
+from heatsplat.thermal.network_options import TERMS
 from heatsplat.thermal.weather_drive import columns_at, remembered, source_of_sunlight, sunlight_at
 
 ALL = {"smooth": 1.0, "physical": 0.01, "ode": 0.01, "pinn": 1.0}
@@ -449,30 +450,6 @@ def test_the_table_needs_a_class_for_every_point():
     assert penalties(model, splats)["physical"] == 0
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"time": "year"}, "time must be one of scene, record, day, none"),
-        ({"features": "rgb"}, "features must be one of"),
-        ({"sky": "blue"}, "sky must be one of"),
-        ({"projected_area": "shadow"}, "projected_area must be one of"),
-        ({"width": 0}, "at least 1"),
-        ({"interval_s": (600.0, 60.0)}, "interval_s must be"),
-        ({"interval_s": []}, r"interval_s must be a list of 2 numbers, got \[\]"),
-        ({"weights": {"edges": 1.0}}, "weights are those of smooth"),
-        ({"feature_size": 0}, "feature_size must be at least 1 where features are learned, got 0"),
-        ({"depth_m": -1}, "depth_m and past_h must be above 0 .*, got -1"),
-        ({"past_h": [1.0, -1.0]}, r"depth_m and past_h must be above 0 .*\[1.0, -1.0\]"),
-        ({"past_h": ["a"]}, "past_h must be a list of 1 numbers"),
-        ({"smallest_axis_m": -0.1}, "smallest_axis_m not negative, got .*-0.1"),
-        ({"position_frequencies": 0, "features": "none"}, "all Gaussians are alike"),
-    ],
-)
-def test_unknown_options_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        EnergyNetwork(**options)
-
-
 # Beyond the paper ---------------------------------------------------------------------------------------
 
 
@@ -523,7 +500,7 @@ def test_past_weather_is_seen_as_fading_means():
     model, splats = make(disturb=1.0, past_h=[4.0], time="none")
     before = model.features(splats, query(6 * HOUR_S))
     warmer = torch.where(weather.times_s < 5 * HOUR_S, weather.air_c + 8.0, weather.air_c)
-    model._past = remembered(replace(weather, air_c=warmer), model.past_h)
+    model._past = remembered(replace(weather, air_c=warmer), model.options.past_h)
     assert (model.features(splats, query(6 * HOUR_S)) - before).abs().max() > 1e-3
 
 

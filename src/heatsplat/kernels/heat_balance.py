@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -218,6 +219,78 @@ def weights_of_lanes(y):
     return decay, first, second, third
 
 
+class Surfaces(NamedTuple):
+    """LANES of them: their parameters, and what follows from them; lanes of zeros for effects that are off."""
+
+    rate: Any
+    share: Any
+    absorptance: Any
+    wind: Any
+    inner: Any
+    leak: Any
+    slower: Any
+    coupling: Any
+    sky: Any
+    nx: Any
+    ny: Any
+    nz: Any
+    indoors: Any
+    inverse: Any
+
+
+class Sensitivities(NamedTuple):
+    """Derivatives of surface and core by each parameter."""
+
+    start: Any
+    rate: Any
+    share: Any
+    sun: Any
+    wind: Any
+    inner: Any
+    core: Any
+    slower: Any
+    coupling: Any
+
+
+class State(NamedTuple):
+    """x and y, the digits of them that were lost, and derivatives."""
+
+    x: Any
+    y: Any
+    lost: Any
+    lost_y: Any
+    by: Any
+
+
+class Drivers(NamedTuple):
+    """What drives surfaces at a moment, or what changes of it."""
+
+    air: Any
+    wind: Any
+    wet: Any
+    sky: Any
+    sun: Any
+
+
+class Pace(NamedTuple):
+    """Substeps of an interval, even in what goes from ``root`` by ``root_change``; ``whole`` is its integral."""
+
+    substeps: Any
+    root: Any
+    root_change: Any
+    whole: Any
+
+
+class Side(NamedTuple):
+    """The balance at one end of a substep."""
+
+    drivers: Any
+    x: Any
+    y: Any
+    w: Any
+    force: Any
+
+
 @inline
 def _powers(a, b):
     """(a⁴ - b⁴) / (a - b), without the difference."""
@@ -296,51 +369,351 @@ def _forgetting(balance, going, now, decay):
 
 
 @inline
-def _march_group(
-    group, balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, moments, found
-):
-    """``march`` of LANES Gaussians."""
-    count = rows.shape[0]
+def _loaded(balance, group, parameters, indoors, reference):
+    """LANES surfaces, and their state at the first sample; the last lanes of the last group repeat its last surface."""
     body = np.empty((parameters.shape[1], LANES), parameters.dtype)
     for j in range(LANES):
-        i = min(group * LANES + j, count - 1)
+        i = min(group * LANES + j, parameters.shape[0] - 1)
         for column in range(parameters.shape[1]):
             body[column, j] = parameters[i, column]
-    lit = np.empty((seen.shape[1], LANES), parameters.dtype)
-    if shaded(balance):
-        for j in range(LANES):
-            i = min(group * LANES + j, count - 1)
-            for slot in range(seen.shape[1]):
-                lit[slot, j] = seen[i, slot]
-    told = np.empty((found.shape[2], LANES), parameters.dtype)
-    x = load_vector(body, START)
+    x, log_rate = load_vector(body, START), load_vector(body, LOG_RATE)
     nothing = x * 0.0
     one = nothing + 1.0
-    r = exp(load_vector(body, LOG_RATE))
-    p, g, v, f, nx, ny, nz = nothing, nothing, nothing, one, nothing, nothing, nothing
-    y, inner, leak, slower, coupling = nothing, nothing, nothing, nothing, nothing
+    share, absorptance, wind, inner, leak = nothing, nothing, nothing, nothing, nothing
+    y, slower, coupling, sky, nx, ny, nz = nothing, nothing, nothing, one, nothing, nothing, nothing
     if radiates(balance):
-        p = load_vector(body, share_column(balance))
+        share = load_vector(body, share_column(balance))
     if sunny(balance):
-        g = load_vector(body, sun_column(balance))
+        absorptance = load_vector(body, sun_column(balance))
     if windy(balance):
-        v = load_vector(body, wind_column(balance))
+        wind = load_vector(body, wind_column(balance))
     if heated(balance):
         inner = load_vector(body, inner_column(balance))
         leak = maximum(inner * indoors, 0.0)
     if cored(balance):
         column = core_column(balance)
         y, coupling = load_vector(body, column), exp(load_vector(body, column + 2))
-        slower = exp(load_vector(body, column + 1) - load_vector(body, LOG_RATE))
+        slower = exp(load_vector(body, column + 1) - log_rate)
     if oriented(balance):
         column = normal_column(balance)
-        f = load_vector(body, column + 3)
         nx, ny, nz = load_vector(body, column), load_vector(body, column + 1), load_vector(body, column + 2)
-    lost, lost_y = nothing, nothing
+        sky = load_vector(body, column + 3)
+    surfaces = Surfaces(
+        exp(log_rate),
+        share,
+        absorptance,
+        wind,
+        inner,
+        leak,
+        slower,
+        coupling,
+        sky,
+        nx,
+        ny,
+        nz,
+        indoors,
+        1.0 / reference,
+    )
     still = nothing, nothing
-    d_start, d_rate, d_share, d_sun, d_wind = (one, nothing), still, still, still, still
-    d_inner, d_core, d_slower, d_coupling = still, (nothing, one), still, still
-    k, moment, inverse = first, 0, 1.0 / reference
+    by = Sensitivities((one, nothing), still, still, still, still, still, (nothing, one), still, still)
+    return surfaces, State(x, y, nothing, nothing, by)
+
+
+@inline
+def _reached(balance, group, seen, like):
+    """Shares of the beam that reach the lanes of a group, a row for each direction."""
+    lit = np.empty((seen.shape[1], LANES), like.dtype)
+    if shaded(balance):
+        for j in range(LANES):
+            i = min(group * LANES + j, seen.shape[0] - 1)
+            for slot in range(seen.shape[1]):
+                lit[slot, j] = seen[i, slot]
+    return lit
+
+
+@inline
+def _at_sample(balance, surfaces, drivers, lit, slots, k):
+    """Drivers at a sample."""
+    f = surfaces.sky
+    wind, wet, sky, sun = 0.0, 1.0, f, f
+    if windy(balance):
+        wind = drivers[WIND_ANOMALY, k]
+    if wetted(balance):
+        wet = drivers[WETTED, k]
+    if radiates(balance):
+        sky = drivers[AROUND, k] + f * (drivers[SKY, k] - drivers[AROUND, k])
+    if sunny(balance):
+        sun = f * drivers[LIGHT, k]
+        if grounded(balance):
+            sun = sun + (1.0 - f) * drivers[GROUND, k]
+        if oriented(balance):
+            x, y, z = drivers[BEAM_X, k], drivers[BEAM_Y, k], drivers[BEAM_Z, k]
+            beam = maximum(surfaces.nx * x + surfaces.ny * y + surfaces.nz * z, 0.0)
+            if shaded(balance):
+                beam = beam * load_vector(lit, slots[k])
+            sun = sun + beam
+    return Drivers(drivers[AIR, k], wind, wet, sky, sun)
+
+
+@inline
+def _changes(begin, end, share):
+    """What drivers change in that share of an interval, in which they are linear."""
+    return Drivers(
+        share * (end.air - begin.air),
+        share * (end.wind - begin.wind),
+        share * (end.wet - begin.wet),
+        share * (end.sky - begin.sky),
+        share * (end.sun - begin.sun),
+    )
+
+
+@inline
+def _after(begin, changes, passed):
+    """Drivers when that share of their changes has passed."""
+    return Drivers(
+        begin.air + passed * changes.air,
+        begin.wind + passed * changes.wind,
+        begin.wet + passed * changes.wet,
+        begin.sky + passed * changes.sky,
+        begin.sun + passed * changes.sun,
+    )
+
+
+@inline
+def _hastened(balance, surfaces, wind, wet, exchange):
+    """An exchange with the air, by wind and water."""
+    if windy(balance):
+        exchange = exchange * (1.0 + surfaces.wind * wind)
+    if wetted(balance):
+        exchange = exchange * wet
+    return exchange
+
+
+@inline
+def _exchange(balance, surfaces, wind, wet):
+    """c, with the air."""
+    exchange = _hastened(balance, surfaces, wind, wet, surfaces.share * 0.0 + 1.0)
+    if radiates(balance):
+        exchange = (1.0 - surfaces.share) * exchange
+    return exchange
+
+
+@inline
+def _stiffness(balance, surfaces, exchange, steep):
+    """By how much dx/dt / r falls with x, of bodies of one node, at an exchange with the air."""
+    if radiates(balance):
+        exchange = exchange + surfaces.share * steep
+    if heated(balance):
+        exchange = exchange + surfaces.leak
+    return exchange
+
+
+@inline
+def _pace(balance, surfaces, begin, changes, steep, seconds):
+    """How an interval is divided: enough for the fastest that surfaces are in it."""
+    wind_2, wet_2 = begin.wind + changes.wind, begin.wet + changes.wet
+    fastest = _exchange(balance, surfaces, max(begin.wind, wind_2), max(begin.wet, wet_2))
+    settled = surfaces.rate * _stiffness(balance, surfaces, fastest, steep) * seconds
+    settles = settled > STEP
+    substeps = minimum(1.0 + floor(settled * (1.0 / STEP)), SUBSTEPS)
+    nothing = settled * 0.0
+    one = nothing + 1.0
+    root, root_change, whole = one, nothing, one * 4.0
+    if changing(balance) and bits(settles) != 0:
+        # Of a body that follows at once, a substep errs by the square of what exchange changes in it: substeps are even
+        # in its fourth root, near enough to its logarithm.
+        early = _stiffness(balance, surfaces, _exchange(balance, surfaces, begin.wind, begin.wet), steep)
+        late = _stiffness(balance, surfaces, _exchange(balance, surfaces, wind_2, wet_2), steep)
+        root = select(settles, sqrt(sqrt(maximum(early, CALM))), one)
+        root_change = select(settles, sqrt(sqrt(maximum(late, CALM))) - root, nothing)
+        whole = _powers(root + root_change, root)
+        folds = maximum(root_change, -root_change) / minimum(root, root + root_change)
+        settling = minimum(maximum(settled - STEP, 0.0) * (1.0 / SETTLING), 1.0)
+        substeps = maximum(substeps, minimum(1.0 + floor(BEND * folds * settling), GUSTS))
+    return Pace(substeps, root, root_change, whole)
+
+
+@inline
+def _passed(balance, pace, substep):
+    """Share of the interval at the end of a substep."""
+    passed = 1.0 / pace.substeps * (substep + 1)
+    if changing(balance):
+        passed = passed * _powers(pace.root + passed * pace.root_change, pace.root) / pace.whole
+    return passed
+
+
+@inline
+def _side(balance, surfaces, drivers, x, y, w):
+    """The balance of surfaces at x, of cores at y, with w of x."""
+    force = _exchange(balance, surfaces, drivers.wind, drivers.wet) * (drivers.air - x)
+    if sunny(balance):
+        force = force + surfaces.absorptance * drivers.sun
+    if radiates(balance):
+        force = force + surfaces.share * (drivers.sky - w)
+    if heated(balance):
+        force = force + surfaces.inner - surfaces.leak * x
+    if cored(balance):
+        force = force - surfaces.coupling * (x - y)
+    return Side(drivers, x, y, w, force)
+
+
+@inline
+def _by_share(balance, surfaces, side):
+    """Derivative of the balance by p."""
+    drivers = side.drivers
+    return drivers.sky - side.w - _hastened(balance, surfaces, drivers.wind, drivers.wet, drivers.air - side.x)
+
+
+@inline
+def _by_wind(balance, surfaces, side):
+    """Derivative of the balance by v."""
+    drivers = side.drivers
+    gust = drivers.wind * (drivers.air - side.x)
+    if radiates(balance):
+        gust = (1.0 - surfaces.share) * gust
+    if wetted(balance):
+        gust = gust * drivers.wet
+    return gust
+
+
+@inline
+def _by_inner(surfaces, side):
+    """Derivative of the balance by f, which lets heat out where it has the sign of i."""
+    one = side.x * 0.0 + 1.0
+    return select(surfaces.inner * surfaces.indoors >= 0.0, one - surfaces.indoors * side.x, one)
+
+
+@inline
+def _sensitivities(balance, surfaces, going, by, functions, rh, early, late):
+    """Derivatives after a substep: of the linearised balance, along the trajectory from its beginning to its end.
+
+    Decays at the slope of its beginning, which takes 0.2 % from what derivatives are, and no second exponential.
+    """
+    decay, phi, second, _ = functions
+    nothing = rh * 0.0
+    before, after = (rh * (phi[0] - second[0]), nothing), (rh * second[0], nothing)
+    share, sun, wind, inner, core, slower, coupling = (
+        by.share, by.sun, by.wind, by.inner, by.core, by.slower, by.coupling,
+    )  # fmt: skip
+    if cored(balance):
+        before, after = (before[0], rh * (phi[1] - second[1])), (after[0], rh * second[1])
+        # What drives cores, by the other half of the matrix.
+        before_core = rh * (phi[2] - second[2]), rh * (phi[3] - second[3])
+        after_core = rh * second[2], rh * second[3]
+        apart, apart_2 = early.x - early.y, late.x - late.y
+        core = _forgetting(balance, going, core, decay)
+        slower = _carried(
+            balance, going, slower, decay, before_core, surfaces.slower * apart, after_core, surfaces.slower * apart_2
+        )
+        coupling = _carried(
+            balance, going, coupling, decay, before, -surfaces.coupling * apart, after, -surfaces.coupling * apart_2
+        )
+    start = _forgetting(balance, going, by.start, decay)
+    rate = _carried(balance, going, by.rate, decay, before, early.force, after, late.force)
+    if radiates(balance):
+        first, last = _by_share(balance, surfaces, early), _by_share(balance, surfaces, late)
+        share = _carried(balance, going, share, decay, before, first, after, last)
+    if sunny(balance):
+        sun = _carried(balance, going, sun, decay, before, early.drivers.sun, after, late.drivers.sun)
+    if windy(balance):
+        first, last = _by_wind(balance, surfaces, early), _by_wind(balance, surfaces, late)
+        wind = _carried(balance, going, wind, decay, before, first, after, last)
+    if heated(balance):
+        inner = _carried(
+            balance, going, inner, decay, before, _by_inner(surfaces, early), after, _by_inner(surfaces, late)
+        )
+    return Sensitivities(start, rate, share, sun, wind, inner, core, slower, coupling)
+
+
+@inline
+def _substep(balance, surfaces, state, going, rh, begin, end):
+    """The state after a substep between two sets of drivers, of the lanes that are still ``going``."""
+    x, y, p = state.x, state.y, surfaces.share
+    w, steep = power(x, surfaces.inverse)
+    early = _side(balance, surfaces, begin, x, y, w)
+    force, ahead = early.force, _side(balance, surfaces, end, x, y, w).force
+    # Linear part: the slope of w here, and the exchange with the air halfway.
+    c, c_2 = _exchange(balance, surfaces, begin.wind, begin.wet), _exchange(balance, surfaces, end.wind, end.wet)
+    slope = _stiffness(balance, surfaces, 0.5 * (c + c_2), steep)
+    functions = _functions(balance, slope, rh, surfaces.slower, surfaces.coupling)
+    _, phi, second, third = functions
+    added, added_y = rh * (phi[0] * force + second[0] * (ahead - force)), rh * 0.0
+    if cored(balance):
+        follows = surfaces.slower * (x - y)
+        added = added + rh * phi[2] * follows
+        added_y = rh * (phi[1] * force + second[1] * (ahead - force) + phi[3] * follows)
+    if changing(balance) or radiates(balance):
+        # What is not linear in time or in x: the products of exchange and air, and of exchange and x, and T⁴.
+        w_d, air_d = power(x + added, surfaces.inverse)[0] - w, end.air - begin.air
+        bent = _bent(balance, second[0], third[0], c_2 - c, air_d, added, p, steep, w_d)
+        if cored(balance):
+            added_y = added_y + rh * _bent(balance, second[1], third[1], c_2 - c, air_d, added, p, steep, w_d)
+        added = added + rh * bent
+    # What digits of x do not hold is added with the next substep (Kahan 1965): between samples a second apart a wall
+    # changes by less than they show.
+    added, added_y = added + state.lost, added_y + state.lost_y
+    new, new_y = x + added, y + added_y
+    lost, lost_y = select(going, added - (new - x), state.lost), state.lost_y
+    if cored(balance):
+        lost_y = select(going, added_y - (new_y - y), lost_y)
+    by = state.by
+    if sensitive(balance):
+        late = _side(balance, surfaces, end, new, new_y, power(new, surfaces.inverse)[0])
+        by = _sensitivities(balance, surfaces, going, by, functions, rh, early, late)
+    return State(select(going, new, x), select(going, new_y, y), lost, lost_y, by)
+
+
+@inline
+def _over_interval(balance, surfaces, state, begin, changes, seconds):
+    """The state after those seconds, in which drivers change linearly."""
+    pace = _pace(balance, surfaces, begin, changes, power(state.x, surfaces.inverse)[1], seconds)
+    passed, rh = surfaces.rate * 0.0, surfaces.rate * (1.0 / pace.substeps) * seconds
+    for substep in range(GUSTS):
+        going = pace.substeps > substep
+        if bits(going) == 0:
+            break
+        later = _passed(balance, pace, substep)
+        if changing(balance):
+            rh = surfaces.rate * (later - passed) * seconds
+        before, after = _after(begin, changes, passed), _after(begin, changes, later)
+        state = _substep(balance, surfaces, state, going, rh, before, after)
+        passed = later
+    return state
+
+
+@inline
+def _store(balance, told, state):
+    """Fills ``told`` [columns of found, LANES]."""
+    store_vector(told, 0, state.x)
+    if sensitive(balance):
+        store_vector(told, 1 + START, state.by.start[0])
+        store_vector(told, 1 + LOG_RATE, state.by.rate[0])
+        if radiates(balance):
+            store_vector(told, 1 + share_column(balance), state.by.share[0])
+        if sunny(balance):
+            store_vector(told, 1 + sun_column(balance), state.by.sun[0])
+        if windy(balance):
+            store_vector(told, 1 + wind_column(balance), state.by.wind[0])
+        if heated(balance):
+            store_vector(told, 1 + inner_column(balance), state.by.inner[0])
+        if cored(balance):
+            column = 1 + core_column(balance)
+            store_vector(told, column, state.by.core[0])
+            store_vector(told, column + 1, state.by.slower[0])
+            store_vector(told, column + 2, state.by.coupling[0])
+    elif cored(balance):
+        store_vector(told, 1, state.y)
+
+
+@inline
+def _march_group(
+    group, balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, moments, found
+):
+    """``march`` of LANES Gaussians."""
+    surfaces, state = _loaded(balance, group, parameters, indoors, reference)
+    lit = _reached(balance, group, seen, parameters)
+    told = np.empty((found.shape[2], LANES), parameters.dtype)
+    k, moment = first, 0
     while moment < moments.shape[0]:
         # To the end of the interval; to a moment within it on the way, after which the state is that of before.
         interval = times[k + 1] - times[k]
@@ -348,211 +721,17 @@ def _march_group(
         ending = 1.0
         if aside:
             ending = (moments[moment] - times[k]) / interval
-        seconds = interval * ending
-        kept = x, y, lost, lost_y, d_start, d_rate, d_share, d_sun, d_wind, d_inner, d_core, d_slower, d_coupling
-        # Drivers at its beginning, and what they change until its end.
-        air_1, air_d = drivers[AIR, k], ending * (drivers[AIR, k + 1] - drivers[AIR, k])
-        wind_1, wind_d, sky_1, sky_d, sun_1, sun_d = 0.0, 0.0, nothing, nothing, nothing, nothing
-        fastest = one
-        if windy(balance):
-            wind_1, wind_d = (
-                drivers[WIND_ANOMALY, k],
-                ending * (drivers[WIND_ANOMALY, k + 1] - drivers[WIND_ANOMALY, k]),
-            )
-            fastest = fastest + v * max(wind_1, wind_1 + wind_d)
-        wet_1, wet_d = 1.0, 0.0
-        if wetted(balance):
-            wet_1, wet_d = drivers[WETTED, k], ending * (drivers[WETTED, k + 1] - drivers[WETTED, k])
-            fastest = fastest * max(wet_1, wet_1 + wet_d)
-        if radiates(balance):
-            _, steep = power(x, inverse)
-            fastest = (1.0 - p) * fastest + p * steep
-            sky_1 = drivers[AROUND, k] + f * (drivers[SKY, k] - drivers[AROUND, k])
-            sky_d = drivers[AROUND, k + 1] + f * (drivers[SKY, k + 1] - drivers[AROUND, k + 1]) - sky_1
-            sky_d = ending * sky_d
-        if heated(balance):
-            fastest = fastest + leak
-        if sunny(balance):
-            sun_1, sun_d = f * drivers[LIGHT, k], f * drivers[LIGHT, k + 1]
-            if grounded(balance):
-                sun_1 = sun_1 + (1.0 - f) * drivers[GROUND, k]
-                sun_d = sun_d + (1.0 - f) * drivers[GROUND, k + 1]
-            if oriented(balance):
-                beam = maximum(nx * drivers[BEAM_X, k] + ny * drivers[BEAM_Y, k] + nz * drivers[BEAM_Z, k], 0.0)
-                beam_2 = nx * drivers[BEAM_X, k + 1] + ny * drivers[BEAM_Y, k + 1] + nz * drivers[BEAM_Z, k + 1]
-                beam_2 = maximum(beam_2, 0.0)
-                if shaded(balance):
-                    beam, beam_2 = beam * load_vector(lit, slots[k]), beam_2 * load_vector(lit, slots[k + 1])
-                sun_1, sun_d = sun_1 + beam, sun_d + beam_2
-            sun_d = ending * (sun_d - sun_1)
-        settled = r * fastest * seconds
-        settles = settled > STEP
-        substeps = minimum(1.0 + floor(settled * (1.0 / STEP)), SUBSTEPS)
-        root, root_d, whole = one, nothing, one * 4.0
-        if changing(balance) and bits(settles) != 0:
-            # Of a body that follows at once, a substep errs by the square of what exchange changes in it: substeps are even
-            # in its fourth root, near enough to its logarithm.
-            exchange, exchange_2 = one, one
-            if windy(balance):
-                exchange, exchange_2 = 1.0 + v * wind_1, 1.0 + v * (wind_1 + wind_d)
-            if wetted(balance):
-                exchange, exchange_2 = exchange * wet_1, exchange_2 * (wet_1 + wet_d)
-            if radiates(balance):
-                exchange, exchange_2 = (1.0 - p) * exchange + p * steep, (1.0 - p) * exchange_2 + p * steep
-            if heated(balance):
-                exchange, exchange_2 = exchange + leak, exchange_2 + leak
-            root = select(settles, sqrt(sqrt(maximum(exchange, CALM))), one)
-            root_d = select(settles, sqrt(sqrt(maximum(exchange_2, CALM))) - root, nothing)
-            whole = _powers(root + root_d, root)
-            folds = maximum(root_d, -root_d) / minimum(root, root + root_d)
-            settling = minimum(maximum(settled - STEP, 0.0) * (1.0 / SETTLING), 1.0)
-            substeps = maximum(substeps, minimum(1.0 + floor(BEND * folds * settling), GUSTS))
-        share = 1.0 / substeps
-        passed, rh = nothing, r * share * seconds
-        for substep in range(GUSTS):
-            going = substeps > substep
-            if bits(going) == 0:
-                break
-            # Linear part: the slope of w here, and the wind halfway.
-            later = share * (substep + 1)
-            if changing(balance):
-                later = later * _powers(root + later * root_d, root) / whole
-                rh = r * (later - passed) * seconds
-            air, air_2, c, c_2 = air_1 + passed * air_d, air_1 + later * air_d, one, one
-            w, steep, sky, sky_2, sun, sun_2 = nothing, nothing, nothing, nothing, nothing, nothing
-            wind, wind_2 = nothing, nothing
-            if windy(balance):
-                wind, wind_2 = wind_1 + passed * wind_d, wind_1 + later * wind_d
-                c, c_2 = 1.0 + v * wind, 1.0 + v * wind_2
-            wet, wet_2 = one, one
-            if wetted(balance):
-                wet, wet_2 = wet_1 + passed * wet_d, wet_1 + later * wet_d
-                c, c_2 = c * wet, c_2 * wet_2
-            if radiates(balance):
-                c, c_2 = (1.0 - p) * c, (1.0 - p) * c_2
-            slope, force, ahead = 0.5 * (c + c_2), c * (air - x), c_2 * (air_2 - x)
-            if sunny(balance):
-                sun, sun_2 = sun_1 + passed * sun_d, sun_1 + later * sun_d
-                force, ahead = force + g * sun, ahead + g * sun_2
-            if radiates(balance):
-                sky, sky_2 = sky_1 + passed * sky_d, sky_1 + later * sky_d
-                w, steep = power(x, inverse)
-                slope, force, ahead = slope + p * steep, force + p * (sky - w), ahead + p * (sky_2 - w)
-            if heated(balance):
-                slope, force, ahead = slope + leak, force + inner - leak * x, ahead + inner - leak * x
-            decay, phi, second, third = _functions(balance, slope, rh, slower, coupling)
-            follows = slower * (x - y)
-            if cored(balance):
-                force, ahead = force - coupling * (x - y), ahead - coupling * (x - y)
-            added, added_y = rh * (phi[0] * force + second[0] * (ahead - force)), nothing
-            if cored(balance):
-                added = added + rh * phi[2] * follows
-                added_y = rh * (phi[1] * force + second[1] * (ahead - force) + phi[3] * follows)
-            w_2 = w
-            if changing(balance) or radiates(balance):
-                # What is not linear in time or in x: the products of exchange and air, and of exchange and x, and T⁴.
-                linear, w_2 = added, w
-                if radiates(balance):
-                    w_2, _ = power(x + added, inverse)
-                added = added + rh * _bent(
-                    balance, second[0], third[0], c_2 - c, air_2 - air, linear, p, steep, w_2 - w
-                )
-                if cored(balance):
-                    rest = _bent(balance, second[1], third[1], c_2 - c, air_2 - air, linear, p, steep, w_2 - w)
-                    added_y = added_y + rh * rest
-            # What digits of x do not hold is added with the next substep (Kahan 1965): between samples a second apart a wall
-            # changes by less than they show.
-            added, added_y = added + lost, added_y + lost_y
-            new, new_y = x + added, y + added_y
-            lost = select(going, added - (new - x), lost)
-            if cored(balance):
-                lost_y = select(going, added_y - (new_y - y), lost_y)
-            if sensitive(balance):
-                # The linearised balance, along the trajectory from its beginning to its end. Decays at the slope of its
-                # beginning, which takes 0.2 % from what derivatives are, and no second exponential.
-                change = c_2 * (air_2 - new)
-                if radiates(balance):
-                    w_2, _ = power(new, inverse)
-                    change = change + p * (sky_2 - w_2)
-                if sunny(balance):
-                    change = change + g * sun_2
-                if heated(balance):
-                    change = change + inner - leak * new
-                before, after = (rh * (phi[0] - second[0]), nothing), (rh * second[0], nothing)
-                if cored(balance):
-                    exchanged = coupling * (new - new_y)
-                    change = change - exchanged
-                    before, after = (before[0], rh * (phi[1] - second[1])), (after[0], rh * second[1])
-                    sooner, later_on = (
-                        (rh * (phi[2] - second[2]), rh * (phi[3] - second[3])),
-                        (rh * second[2], rh * second[3]),
-                    )
-                    d_core = _forgetting(balance, going, d_core, decay)
-                    d_slower = _carried(
-                        balance, going, d_slower, decay, sooner, follows, later_on, slower * (new - new_y)
-                    )
-                    d_coupling = _carried(
-                        balance, going, d_coupling, decay, before, -coupling * (x - y), after, -exchanged
-                    )
-                d_rate = _carried(balance, going, d_rate, decay, before, force, after, change)
-                d_start = _forgetting(balance, going, d_start, decay)
-                if radiates(balance):
-                    calm, calm_2 = air - x, air_2 - new
-                    if windy(balance):
-                        calm, calm_2 = calm * (1.0 + v * wind), calm_2 * (1.0 + v * wind_2)
-                    if wetted(balance):
-                        calm, calm_2 = calm * wet, calm_2 * wet_2
-                    d_share = _carried(
-                        balance, going, d_share, decay, before, sky - w - calm, after, sky_2 - w_2 - calm_2
-                    )
-                if sunny(balance):
-                    d_sun = _carried(balance, going, d_sun, decay, before, sun, after, sun_2)
-                if windy(balance):
-                    gust, gust_2 = wind * (air - x), wind_2 * (air_2 - new)
-                    if radiates(balance):
-                        gust, gust_2 = (1.0 - p) * gust, (1.0 - p) * gust_2
-                    if wetted(balance):
-                        gust, gust_2 = gust * wet, gust_2 * wet_2
-                    d_wind = _carried(balance, going, d_wind, decay, before, gust, after, gust_2)
-                if heated(balance):
-                    lets_out = inner * indoors >= 0.0
-                    warms, warms_2 = (
-                        select(lets_out, one - indoors * x, one),
-                        select(lets_out, one - indoors * new, one),
-                    )
-                    d_inner = _carried(balance, going, d_inner, decay, before, warms, after, warms_2)
-            x, y = select(going, new, x), select(going, new_y, y)
-            passed = later
-        if not aside:
-            k += 1
-            continue
-        store_vector(told, 0, x)
-        if sensitive(balance):
-            store_vector(told, 1 + START, d_start[0])
-            store_vector(told, 1 + LOG_RATE, d_rate[0])
-            if radiates(balance):
-                store_vector(told, 1 + share_column(balance), d_share[0])
-            if sunny(balance):
-                store_vector(told, 1 + sun_column(balance), d_sun[0])
-            if windy(balance):
-                store_vector(told, 1 + wind_column(balance), d_wind[0])
-            if heated(balance):
-                store_vector(told, 1 + inner_column(balance), d_inner[0])
-            if cored(balance):
-                column = 1 + core_column(balance)
-                store_vector(told, column, d_core[0])
-                store_vector(told, column + 1, d_slower[0])
-                store_vector(told, column + 2, d_coupling[0])
-        elif cored(balance):
-            store_vector(told, 1, y)
-        for j in range(min(LANES, count - group * LANES)):
-            for column in range(found.shape[2]):
-                found[moment, rows[group * LANES + j], column] = told[column, j]
-        moment += 1
+        begin = _at_sample(balance, surfaces, drivers, lit, slots, k)
+        changes = _changes(begin, _at_sample(balance, surfaces, drivers, lit, slots, k + 1), ending)
+        then = _over_interval(balance, surfaces, state, begin, changes, interval * ending)
+        if aside:
+            _store(balance, told, then)
+            for j in range(min(LANES, rows.shape[0] - group * LANES)):
+                for column in range(found.shape[2]):
+                    found[moment, rows[group * LANES + j], column] = told[column, j]
+            moment += 1
         if ending == 1.0:
-            k += 1
-        else:
-            x, y, lost, lost_y, d_start, d_rate, d_share, d_sun, d_wind, d_inner, d_core, d_slower, d_coupling = kept
+            k, state = k + 1, then
 
 
 @kernel

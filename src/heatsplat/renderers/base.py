@@ -105,49 +105,11 @@ def rasterization(
             intrinsics have skew or want a gradient of "gsplat", or the backend is unknown.
         ImportError: the backend is gsplat and it is not installed (the message says how to get it).
     """
-    n = means.shape[0]
-    for name, tensor, shape in (("means", means, (n, 3)), ("quats", quats, (n, 4)), ("scales", scales, (n, 3))):
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, got {list(tensor.shape)}")
-    if opacities.ndim == 1:
-        opacities = opacities[None]
-    if opacities.ndim != 2 or opacities.shape[1] != n:
-        raise ValueError(f"opacities must have shape [{n}] or [M, {n}], got {list(opacities.shape)}")
-    if means.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"Gaussians must be float32 or float64, got means of {means.dtype}")
-    given = {"quats": quats, "scales": scales, "opacities": opacities, "features": features, "background": background}
-    for name, tensor in given.items():
-        if isinstance(tensor, Tensor) and (tensor.dtype != means.dtype or tensor.device != means.device):
-            raise ValueError(
-                f"{name} must be like means, {means.dtype} on {means.device}, got {tensor.dtype} on {tensor.device}"
-            )
-    if isinstance(features, Tensor) and (features.ndim != 2 or features.shape[0] != n):
-        raise ValueError(f"features must have shape [{n}, C], got {list(features.shape)}")
-    if tuple(viewmats.shape) != (4, 4) or tuple(Ks.shape) != (3, 3):
-        raise ValueError(f"viewmats and Ks must be [4, 4] and [3, 3], got {list(viewmats.shape)} and {list(Ks.shape)}")
-    # On a GPU a look at it would wait for the device.
-    if Ks.device.type == "cpu" and (skew := float(Ks.detach()[0, 1])):
-        raise ValueError(f"Ks has a skew of {skew:.6g} (its [0, 1]), which no renderer has: undistort images to 0")
-    if signs is not None and tuple(signs.shape) != (n,):
-        raise ValueError(f"signs must have shape [{n}], got {list(signs.shape)}")
-    if opacities.shape[0] > 1 and modality_channels is None:
-        raise ValueError(f"{opacities.shape[0]} opacity sets need modality_channels, such as (3, 1)")
-    if modality_channels is not None and len(modality_channels) != opacities.shape[0]:
-        raise ValueError(f"modality_channels {tuple(modality_channels)} must name {opacities.shape[0]} counts")
-    if not eps2d > 0:
-        raise ValueError(f"eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1), got {eps2d}")
-    if not near < far:
-        raise ValueError(f"far must be beyond near, got near {near} and far {far}")
-    if width < 1 or height < 1:
-        raise ValueError(f"image must have pixels, got {width} x {height}")
-    if backend == "auto":
-        backend = "gsplat" if means.device.type == "cuda" else "cpu" if means.dtype == torch.float32 else "reference"
-    if backend not in BACKENDS:
-        raise ValueError(f"unknown renderer backend '{backend}'; there are {', '.join(BACKENDS)} and auto")
-    if backend == "gsplat" and Ks.requires_grad:
-        raise ValueError(
-            "gsplat gives no gradient to Ks: detach it, or take backend='cpu' or 'reference', which give those of fx, fy, cx, cy"
-        )
+    opacities = opacities[None] if opacities.ndim == 1 else opacities
+    _check_gaussians(means, quats, scales, opacities, features, background, signs)
+    _check_modalities(modality_channels, len(opacities))
+    _check_camera(viewmats, Ks, width, height, near, far, eps2d)
+    backend = _backend_of(backend, means, Ks)
     if raw and backend != "cpu":
         scales, opacities, raw = scales.exp(), opacities.sigmoid(), False
     native = maps if backend == "cpu" else 0  # the others sum maps as gradients of channels that are zero
@@ -165,6 +127,68 @@ def rasterization(
     )  # fmt: skip
     output = import_module(f"heatsplat.renderers.{backend}").render(inputs)
     return output if probe is None else probe.read(output)
+
+
+def _check_gaussians(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor | Callable[[Tensor], Tensor],
+    background: Tensor | None,
+    signs: Tensor | None,
+) -> None:
+    n = means.shape[0]
+    for name, tensor, shape in (("means", means, (n, 3)), ("quats", quats, (n, 4)), ("scales", scales, (n, 3))):
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, got {list(tensor.shape)}")
+    if opacities.ndim != 2 or opacities.shape[1] != n:
+        raise ValueError(f"opacities must have shape [{n}] or [M, {n}], got {list(opacities.shape)}")
+    if means.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"Gaussians must be float32 or float64, got means of {means.dtype}")
+    given = {"quats": quats, "scales": scales, "opacities": opacities, "features": features, "background": background}
+    for name, tensor in given.items():
+        if isinstance(tensor, Tensor) and (tensor.dtype != means.dtype or tensor.device != means.device):
+            raise ValueError(
+                f"{name} must be like means, {means.dtype} on {means.device}, got {tensor.dtype} on {tensor.device}"
+            )
+    if isinstance(features, Tensor) and (features.ndim != 2 or features.shape[0] != n):
+        raise ValueError(f"features must have shape [{n}, C], got {list(features.shape)}")
+    if signs is not None and tuple(signs.shape) != (n,):
+        raise ValueError(f"signs must have shape [{n}], got {list(signs.shape)}")
+
+
+def _check_modalities(channels: Sequence[int] | None, modalities: int) -> None:
+    if modalities > 1 and channels is None:
+        raise ValueError(f"{modalities} opacity sets need modality_channels, such as (3, 1)")
+    if channels is not None and len(channels) != modalities:
+        raise ValueError(f"modality_channels {tuple(channels)} must name {modalities} counts")
+
+
+def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, near: float, far: float, eps2d: float) -> None:
+    if tuple(viewmats.shape) != (4, 4) or tuple(Ks.shape) != (3, 3):
+        raise ValueError(f"viewmats and Ks must be [4, 4] and [3, 3], got {list(viewmats.shape)} and {list(Ks.shape)}")
+    # On a GPU a look at it would wait for the device.
+    if Ks.device.type == "cpu" and (skew := float(Ks.detach()[0, 1])):
+        raise ValueError(f"Ks has a skew of {skew:.6g} (its [0, 1]), which no renderer has: undistort images to 0")
+    if not eps2d > 0:
+        raise ValueError(f"eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1), got {eps2d}")
+    if not near < far:
+        raise ValueError(f"far must be beyond near, got near {near} and far {far}")
+    if width < 1 or height < 1:
+        raise ValueError(f"image must have pixels, got {width} x {height}")
+
+
+def _backend_of(asked: str, means: Tensor, Ks: Tensor) -> str:
+    if asked == "auto":
+        asked = "gsplat" if means.device.type == "cuda" else "cpu" if means.dtype == torch.float32 else "reference"
+    if asked not in BACKENDS:
+        raise ValueError(f"unknown renderer backend '{asked}'; there are {', '.join(BACKENDS)} and auto")
+    if asked == "gsplat" and Ks.requires_grad:
+        raise ValueError(
+            "gsplat gives no gradient to Ks: detach it, or take backend='cpu' or 'reference', which give those of fx, fy, cx, cy"
+        )
+    return asked
 
 
 class _Probe:

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, Weather, check_numbers, check_option
+from heatsplat.contracts import WEATHER_COLUMNS, SceneData, SceneError, Weather
 from heatsplat.physics.ellipsoids import SMALLEST_AXIS_M
 from heatsplat.physics.units import DAY_S
 from heatsplat.same_bits import mean, sigmoid
@@ -23,26 +23,17 @@ from heatsplat.thermal.coordinates import (
     Box,
     Clock,
     ImageRange,
-    check_frames_per_cycle,
     octaves,
     sees_hours,
     slow_octaves,
 )
-from heatsplat.thermal.ellipsoid_balance import EllipsoidBalance
 from heatsplat.thermal.land_cover import ATTRIBUTES, CLASSES, check_labels, reference, typical
+from heatsplat.thermal.network_options import NetworkOptions
 from heatsplat.thermal.residual_network import ResidualNetwork
-from heatsplat.thermal.surface_balance import SurfaceBalance
 from heatsplat.thermal.weather_drive import columns_at, remembered, value_at
 
 log = logging.getLogger(__name__)
 
-TIMES = ("scene", "record", "day", "none")
-FEATURES = ("learned", "given", "labels", "none")
-MATERIALS = ("inferred", "constant", "table")
-COLLOCATIONS = ("view", "record")
-BODIES = ("ellipsoid", "surface")
-TERMS = ("smooth", "physical", "ode", "pinn")
-BALANCED = ("ode", "pinn")  # the terms that need the balance of heat
 LATENT = "latent_heat"
 # Least and greatest value of each attribute: no surface lies outside, and no head can leave them.
 LIMITS = {
@@ -169,61 +160,38 @@ class EnergyNetwork(ThermalModel):
         lr_first: float = 2.5e-3,
     ) -> None:
         super().__init__()
-        check_option("time", time, TIMES)
-        check_option("features", features, FEATURES)
-        check_option("attributes", attributes, MATERIALS)
-        check_option("collocation", collocation, COLLOCATIONS)
-        check_option("body", body, BODIES)
-        past_h = tuple(past_h)
-        check_numbers("past_h", past_h, len(past_h))
-        if min((depth_m, *past_h)) <= 0 or smallest_axis_m < 0:
-            raise ValueError(
-                f"depth_m and past_h must be above 0 and smallest_axis_m not negative, got {depth_m}, {list(past_h)} and "
-                f"{smallest_axis_m}"
-            )
-        if body == "surface":
-            self.balance = SurfaceBalance(sky, depth_m)
-        else:
-            self.balance = EllipsoidBalance(projected_area, surface_area, sky, smallest_axis_m)
-        self.collocation, self.past_h = collocation, past_h
-        if min(width, blocks, time_frequencies, sampled) < 1 or min(position_frequencies, first_steps, ramp_steps) < 0:
-            raise ValueError(
-                "width, blocks, time_frequencies and sampled must be at least 1, position_frequencies, first_steps and "
-                f"ramp_steps at least 0, got {width}, {blocks}, {time_frequencies}, {sampled}, {position_frequencies}, "
-                f"{first_steps} and {ramp_steps}"
-            )
-        if features in ("learned", "given") and feature_size < 1:
-            raise ValueError(
-                f"feature_size must be at least 1 where features are {features}, got {feature_size}; without: features=none"
-            )
-        check_numbers("interval_s", interval_s, 2)
-        shortest, longest = interval_s
-        if not 0 < shortest <= longest or margin < 0:
-            raise ValueError(
-                f"interval_s must be two rising positive numbers and margin not negative, got {interval_s}"
-            )
-        check_frames_per_cycle(frames_per_cycle)
-        if set(weights or {}) - set(TERMS):
-            raise ValueError(f"weights are those of {', '.join(TERMS)}, got {', '.join(weights)}")
-        sizes = {"learned": feature_size, "given": feature_size, "labels": len(CLASSES), "none": 0}
-        own = 6 * position_frequencies + sizes[features]
-        if own < 1:
-            raise ValueError("without place and features all Gaussians are alike: set position_frequencies or features")
-
-        self.weights = {name: weight for name, weight in (weights or {}).items() if weight > 0}
-        self.inferred, self.constant = attributes != "table", attributes == "constant"
-        if not self.inferred:
-            self.weights.pop("physical", None)  # nothing is predicted that could be compared
-        self.features_from, self.feature_size = features, sizes[features]
-        self.position_frequencies, self.time_frequencies, self.time = position_frequencies, time_frequencies, time
-        self.frames_per_cycle = frames_per_cycle
-        self.first_steps, self.ramp_steps, self.interval_s = first_steps, ramp_steps, (shortest, longest)
-        self.sampled, self.margin = sampled, margin
+        self.options = NetworkOptions(
+            width=width,
+            blocks=blocks,
+            position_frequencies=position_frequencies,
+            time_frequencies=time_frequencies,
+            time=time,
+            frames_per_cycle=frames_per_cycle,
+            features=features,
+            feature_size=feature_size,
+            attributes=attributes,
+            weights=weights,
+            first_steps=first_steps,
+            ramp_steps=ramp_steps,
+            interval_s=interval_s,
+            collocation=collocation,
+            past_h=tuple(past_h),
+            body=body,
+            depth_m=depth_m,
+            sampled=sampled,
+            projected_area=projected_area,
+            surface_area=surface_area,
+            sky=sky,
+            smallest_axis_m=smallest_axis_m,
+            margin=margin,
+        )
+        self.balance = self.options.balance()
+        self.first_steps = first_steps
         self.path = None if network is None else Path(network).expanduser()
         self.lr, self.lr_end = 0.0 if network is not None and not fine_tune else lr, lr_end
         self.lr_feature, self.lr_first = lr_feature, lr_first
-        self.labelled = not self.inferred or features == "labels" or "physical" in self.weights
-        wanted = {"metres": self._balanced, "labels": self.labelled, "point_features": features == "given"}
+        labelled, given = self.options.labelled, features == "given"
+        wanted = {"metres": self.options.balanced, "labels": labelled, "point_features": given}
         self.needs = frozenset({"time", "thermal_range", "weather"} | {name for name, asked in wanted.items() if asked})
 
         lowest, highest = torch.tensor(list(LIMITS.values())).T
@@ -231,11 +199,11 @@ class EnergyNetwork(ThermalModel):
         self.register_buffer("highest", highest, persistent=False)
         start = torch.logit((typical() - lowest) / (highest - lowest))
         heads = {"temperature": torch.zeros(1)}
-        if self.inferred:
+        if self.options.inferred:
             heads |= {"attributes": start, LATENT: torch.zeros(1)}
         timed = 2 * time_frequencies if time != "none" else 0
-        columns = len(WEATHER_COLUMNS) * (1 + len(self.past_h))
-        self.network = ResidualNetwork(own, timed + columns, width, blocks, heads)
+        columns = len(WEATHER_COLUMNS) * (1 + len(past_h))
+        self.network = ResidualNetwork(self.options.own_inputs, timed + columns, width, blocks, heads)
 
         self.register_buffer("emits", torch.tensor(True))  # the network, not the value of the first stage
         self.box, self.clock, self.range = Box(), Clock(), ImageRange()
@@ -244,8 +212,8 @@ class EnergyNetwork(ThermalModel):
         self.register_buffer("bounds_k", torch.tensor([0.0, 1.0], dtype=torch.float64))  # T_min, and T_max - T_min
         self.register_buffer("weather_mean", torch.zeros(columns, dtype=torch.float64))
         self.register_buffer("weather_scale", torch.zeros(columns, dtype=torch.float64))
-        self.register_buffer("feature_mean", torch.zeros(self.feature_size))
-        self.register_buffer("feature_scale", torch.ones(self.feature_size))
+        self.register_buffer("feature_mean", torch.zeros(self.options.features_each))
+        self.register_buffer("feature_scale", torch.ones(self.options.features_each))
         self.weather: Weather | None = None
         self._past: Tensor | None = None  # [T, k] of the record's samples
         self.metres_per_unit = 1.0
@@ -270,30 +238,33 @@ class EnergyNetwork(ThermalModel):
             if name in without:
                 raise SceneError(f"scene '{scene.name}' lacks '{name}': {without[name]}")
         super().check(scene)
-        if self.labelled:
+        if self.options.labelled:
             check_labels(scene.labels, len(scene.points), scene.name)
-            if not self.inferred and bool((scene.labels < 0).any()):
+            if not self.options.inferred and bool((scene.labels < 0).any()):
                 raise SceneError(
                     f"scene '{scene.name}' has points without a class, for which the table has no attributes: label them, "
                     "or set thermal.attributes=inferred"
                 )
-        if self.features_from == "given" and scene.point_features.shape != (len(scene.points), self.feature_size):
+        shape = (len(scene.points), self.options.features_each)
+        if self.options.features == "given" and scene.point_features.shape != shape:
             raise SceneError(
                 f"scene '{scene.name}' gives features {list(scene.point_features.shape)} for {len(scene.points)} points; "
                 f"set thermal.feature_size={scene.point_features.shape[-1]} and give one row per point"
             )
-        if self._balanced:
+        if self.options.balanced:
             self.balance.check(scene)
 
     def prepare(self, scene: SceneData) -> None:
         self.weather, self.metres_per_unit = scene.weather, scene.metres_per_unit or 1.0
-        self._past = remembered(scene.weather, self.past_h)
+        self._past = remembered(scene.weather, self.options.past_h)
         for constants in (self.box, self.clock, self.range):
             constants.prepare(scene)
-        self.daily.fill_(sees_hours(self.time, scene))
+        self.daily.fill_(sees_hours(self.options.time, scene))
         slowest = self.clock.span_s / DAY_S if self.daily else 0.5
         frames = len(set(scene.train.times_s))
-        self.slow_octaves.fill_(slow_octaves(self.time_frequencies, frames, self.frames_per_cycle, slowest))
+        self.slow_octaves.fill_(
+            slow_octaves(self.options.time_frequencies, frames, self.options.frames_per_cycle, slowest)
+        )
         for frame in (*scene.test.frames, *scene.val.frames):
             scene.weather.at(frame.time_s)  # refuses now what would fail after training
         columns = torch.stack([self._weather_at(time) for time in scene.train.times_s])
@@ -305,12 +276,12 @@ class EnergyNetwork(ThermalModel):
         if missing := self._missing_columns:
             log.warning("the weather of scene '%s' has no %s: the network does without", scene.name, ", ".join(missing))
         lower, width = self.range.lowest_k, self.range.bounds.span_k
-        bounds = [lower - self.margin * width, (1 + 2 * self.margin) * width]
+        bounds = [lower - self.options.margin * width, (1 + 2 * self.options.margin) * width]
         self.bounds_k.copy_(torch.tensor(bounds, dtype=torch.float64))
         self._points = {"means": scene.points.float()}
-        if self.labelled:
+        if self.options.labelled:
             self._points["label"] = scene.labels.float()
-        if self.features_from == "given":
+        if self.options.features == "given":
             given = scene.point_features.float()
             self.feature_mean.copy_(given.mean(0))
             self.feature_scale.copy_(given.std(0, correction=0).clamp(min=1e-6))
@@ -325,15 +296,15 @@ class EnergyNetwork(ThermalModel):
         tensors = {"first_value": PerGaussian(value.clone(), self.lr_first, paced=False)}
         _, nearest = cKDTree(self._points["means"].numpy()).query(seeds.means.numpy(), workers=1)
         nearest = torch.from_numpy(nearest)
-        if self.labelled:
+        if self.options.labelled:
             tensors["label"] = PerGaussian(self._points["label"][nearest], 0.0)
-        if self.features_from == "given":
+        if self.options.features == "given":
             tensors["feature"] = PerGaussian(self._points["feature"][nearest], 0.0)
-        if self._balanced:
+        if self.options.balanced:
             tensors |= self.balance.per_gaussian(seeds)
         self.network.draw(seeds.generator)
-        if self.features_from == "learned":
-            feature = 0.1 * torch.randn(len(value), self.feature_size, generator=seeds.generator)
+        if self.options.features == "learned":
+            feature = 0.1 * torch.randn(len(value), self.options.features_each, generator=seeds.generator)
             spread = value.std(correction=0).clamp(min=1e-3)  # of a single Gaussian it is 0
             feature[:, 0] = (value - mean(value)) / spread  # warm and cold differ from the start
             tensors["feature"] = PerGaussian(feature, self.lr_feature)
@@ -362,10 +333,10 @@ class EnergyNetwork(ThermalModel):
     def regularisers(self, splats: Splats) -> dict[str, Tensor]:
         """Those of "smooth", "physical", "ode" and "pinn" that are on, of the Gaussians last seen with a gradient."""
         seen, self._seen = self._seen, None
-        weights = {name: self._ramp * weight for name, weight in self.weights.items()}
+        weights = {name: self._ramp * weight for name, weight in self.options.penalties.items()}
         if seen is None or not len(seen.ids) or self._ramp == 0 or not weights:
             return {}
-        stride = -(-len(seen.ids) // self.sampled)
+        stride = -(-len(seen.ids) // self.options.sampled)
         rows = torch.arange(self._step % stride, len(seen.ids), stride, device=seen.ids.device)
         ids, base, now = seen.ids[rows], seen.base[rows], seen.units[rows]
         terms = {}
@@ -374,7 +345,7 @@ class EnergyNetwork(ThermalModel):
             terms["physical"] = heat_terms.to_reference(body, reference(splats["label"].detach()[ids].long()))
         start_s, hidden = seen.time_s, seen.hidden[rows]
         ends = float(self.weather.times_s[0]), float(self.weather.times_s[-1])
-        if self.collocation == "record" and set(weights) - {"physical"}:
+        if self.options.collocation == "record" and set(weights) - {"physical"}:
             start_s = ends[0] + (ends[1] - ends[0]) * math.fmod(self._step * PLASTIC, 1.0)
             hidden = self.network(base, self._moment(start_s))
             now = self._units(hidden)
@@ -387,7 +358,7 @@ class EnergyNetwork(ThermalModel):
         later = self._units(last)
         if "smooth" in weights:
             terms["smooth"] = heat_terms.change(now, later)
-        if self._balanced:
+        if self.options.balanced:
             areas = self.balance.areas(splats, ids, self.metres_per_unit)
             first_rate = self._rate(now, self._body(splats, ids, base, hidden), areas, start_s)
             if "ode" in weights:
@@ -396,7 +367,7 @@ class EnergyNetwork(ThermalModel):
                 terms["ode"] = heat_terms.integration(now, later, rate, interval)
             if "pinn" in weights:
                 rate = 0.5 * (first_rate + self._rate(later, self._body(splats, ids, base, last), areas, last_s))
-                terms["pinn"] = heat_terms.difference_quotient(now, later, rate, interval, self.interval_s[1])
+                terms["pinn"] = heat_terms.difference_quotient(now, later, rate, interval, self.options.interval_s[1])
         return {name: weights[name] * term for name, term in terms.items()}
 
     def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
@@ -412,7 +383,7 @@ class EnergyNetwork(ThermalModel):
 
     def prior(self, splats: Splats) -> dict[str, Tensor]:
         """Attributes of the classes, each [N]; NaN where there is no class. Empty for models that use no labels."""
-        if not self.labelled:
+        if not self.options.labelled:
             return {}
         return dict(zip(ATTRIBUTES, reference(splats["label"].detach().long()).unbind(1), strict=True))
 
@@ -420,14 +391,14 @@ class EnergyNetwork(ThermalModel):
         missing = self._missing_columns
         used = [name for name in WEATHER_COLUMNS if name not in missing]
         effects = {"relaxation": {"network_sees": used, "left_out": missing, "time": self._time}}
-        if self._balanced:
+        if self.options.balanced:
             effects |= self.balance.effects(self.weather)
-            effects["radiation"]["materials"] = "inferred" if self.inferred else "table"
+            effects["radiation"]["materials"] = "inferred" if self.options.inferred else "table"
         return effects
 
     @property
     def cost(self) -> int:
-        code = 6 * self.position_frequencies  # sines
+        code = 6 * self.options.position_frequencies  # sines
         return self.network.cost + self.network.heads["temperature"].weight.numel() + code
 
     # The network ----------------------------------------------------------------------------------------
@@ -439,11 +410,7 @@ class EnergyNetwork(ThermalModel):
 
     @property
     def _time(self) -> str:
-        return self.time if self.time == "none" else "day" if self.daily else "record"
-
-    @property
-    def _balanced(self) -> bool:
-        return any(name in self.weights for name in BALANCED)
+        return self.options.time if self.options.time == "none" else "day" if self.daily else "record"
 
     @property
     def _missing_columns(self) -> list[str]:
@@ -453,11 +420,11 @@ class EnergyNetwork(ThermalModel):
 
     @property
     def _ramp(self) -> float:
-        return min(1.0, (self._step - self.first_steps + 1) / (self.ramp_steps + 1))
+        return min(1.0, (self._step - self.first_steps + 1) / (self.options.ramp_steps + 1))
 
     def _interval(self, time_s: float) -> float:
         """Seconds from the view to the other end of the interval: forward, or back where the record ends."""
-        shortest, longest = self.interval_s
+        shortest, longest = self.options.interval_s
         wanted = shortest + (longest - shortest) * math.fmod(self._step * GOLDEN, 1.0)
         first, last = float(self.weather.times_s[0]), float(self.weather.times_s[-1])
         if time_s + wanted <= last:
@@ -468,12 +435,12 @@ class EnergyNetwork(ThermalModel):
         """What the network's first layer makes of all that belongs to the Gaussians, [n, width]."""
         rows = Query(ids).rows
         parts = []
-        if self.position_frequencies:
-            parts.append(octaves(self.box.places(rows(splats.means.detach())), self.position_frequencies))
-        if self.features_from == "labels":
+        if self.options.position_frequencies:
+            parts.append(octaves(self.box.places(rows(splats.means.detach())), self.options.position_frequencies))
+        if self.options.features == "labels":
             labels = rows(splats["label"].detach())[:, None]
             parts.append((labels == torch.arange(len(CLASSES), device=labels.device)).to(self.network.own.weight))
-        elif self.feature_size:
+        elif self.options.features_each:
             parts.append((rows(splats["feature"]) - self.feature_mean) / self.feature_scale)
         return self.network.own(torch.cat(parts, 1))
 
@@ -482,13 +449,12 @@ class EnergyNetwork(ThermalModel):
         mean, scale = self.weather_mean.cpu(), self.weather_scale.cpu()
         weather = torch.where(scale > 0, (self._weather_at(time_s).nan_to_num() - mean) * scale, 0.0)
         parts = [weather]
-        if self.time != "none":
+        if self.options.time != "none":
             # The balance holds also where a penalty's interval reaches some minutes beyond the last image.
             clock = self.clock.spans if self.training else self.clock.within
             share = 2.0 * math.fmod(time_s / DAY_S, 1.0) if self.daily else clock(time_s)
-            parts.append(
-                octaves(torch.tensor([[share]], dtype=torch.float64), self.time_frequencies, self.slow_octaves)[0]
-            )
+            phase = torch.tensor([[share]], dtype=torch.float64)
+            parts.append(octaves(phase, self.options.time_frequencies, self.slow_octaves)[0])
         return torch.cat(parts).to(self.network.own.weight)
 
     def _units(self, hidden: Tensor) -> Tensor:
@@ -509,13 +475,13 @@ class EnergyNetwork(ThermalModel):
     def _weather_at(self, time_s: float) -> Tensor:
         """Present and past weather at a moment, as the network sees it before it is scaled."""
         present = columns_at(self.weather, time_s)
-        return torch.cat([present, value_at(self.weather, self._past, time_s)]) if self.past_h else present
+        return torch.cat([present, value_at(self.weather, self._past, time_s)]) if self.options.past_h else present
 
     def _body(self, splats: Splats, ids: Tensor | None, base: Tensor, hidden: Tensor) -> dict[str, Tensor]:
         """The four attributes, each [n], from hidden values [n, width] or from the table."""
-        if self.constant:
+        if self.options.attributes == "constant":
             hidden = self.network(base, torch.zeros_like(self.network.shared.weight[0]))
-        if self.inferred:
+        if self.options.inferred:
             values = self.lowest + (self.highest - self.lowest) * sigmoid(self.network.heads["attributes"](hidden))
         else:
             values = reference(Query(ids).rows(splats["label"].detach()).long())
