@@ -126,7 +126,7 @@ def test_hours_come_again_where_the_weather_goes_on_for_more_than_a_day():
         longer = replace(scene, weather=replace(weather, times_s=start + stretch * (weather.times_s - start)))
         model, _ = make(longer)
         assert model.effects()["relaxation"]["time"] == time
-    clock = [model._moment(moment)[-2 * model.time_frequencies :] for moment in (HOUR_S, 25 * HOUR_S, 13 * HOUR_S)]
+    clock = [model._moment(moment)[-2 * model.options.time_frequencies :] for moment in (HOUR_S, 25 * HOUR_S, 13 * HOUR_S)]
     torch.testing.assert_close(clock[0], clock[1])
     assert not torch.allclose(clock[0], clock[2], atol=0.1)
 
@@ -136,14 +136,14 @@ def test_the_network_sees_octaves_that_images_tell():
     scene = make_scene(times=[hour * HOUR_S for hour in range(10)])
     for options, seen in (({"time": "record"}, 3), ({"time": "day"}, 3), ({"frames_per_cycle": None}, 10)):
         model, _ = make(scene, **options)
-        code = model._moment(1.3 * HOUR_S)[-2 * model.time_frequencies :].unflatten(0, (2, -1))
+        code = model._moment(1.3 * HOUR_S)[-2 * model.options.time_frequencies :].unflatten(0, (2, -1))
         assert int(code.ne(0).any(0).sum()) == seen
 
 
 def test_beyond_the_record_the_clock_stays_and_the_weather_goes_on():
     model, _ = make()
     last, later = 9 * HOUR_S, 15 * HOUR_S
-    weather, clock = (model.eval()._moment(later) - model._moment(last)).split([5, 2 * model.time_frequencies])
+    weather, clock = (model.eval()._moment(later) - model._moment(last)).split([5, 2 * model.options.time_frequencies])
     assert weather.abs().max() > 0.1 and torch.equal(clock, torch.zeros_like(clock))
     # Intervals of penalties end minutes after the last image, where the balance holds as well.
     assert not torch.equal(model.train()._moment(last + 600)[5:], model._moment(last)[5:])
