@@ -27,6 +27,7 @@ from heatsplat.datamodules.formats.images import (
 )
 from heatsplat.datamodules.formats.radiometric import read_bytes
 from heatsplat.datamodules.timestamps import dji_time, instant, zone_of
+from heatsplat.doctor.base import by_numbers
 from heatsplat.preparation.devices import devices_of, listed
 from heatsplat.preparation.frame import ThermalFrame, frame_name
 from heatsplat.preparation.makers import RECORDS, exif_details, radiometric_frames
@@ -140,11 +141,6 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
             "names (table=... adds times)"
         )
     return Recording(frames, notes)
-
-
-def by_numbers(name: str) -> list[str | int]:
-    """What names are sorted by so that "image 2" comes before "image 10"."""
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name))]
 
 
 def _kind(path: Path) -> str:

@@ -15,6 +15,15 @@ def test_clocks_that_run_back_repeats_and_gaps_are_found():
     assert "times" in checks(replace(clean(), times_s=[t - t % 20 for t in times]))
 
 
+def test_names_that_count_without_leading_zeros_are_in_the_order_of_their_numbers():
+    count = len(clean().names)
+    counted = replace(
+        clean(), names=[f"image ({i + 1}).tiff" for i in range(count)], times_s=[10.0 * i for i in range(count)]
+    )
+    assert "times" not in checks(counted)
+    assert "times" in checks(replace(counted, times_s=[10.0 * i if i < 8 else 10.0 * i - 55 for i in range(count)]))
+
+
 def test_a_second_camera_that_began_earlier_is_no_clock_that_runs_back():
     count = len(clean().names)
     of_two = replace(clean(), times_s=[10.0 * i if i < 8 else 10.0 * i - 75 for i in range(count)])

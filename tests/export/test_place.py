@@ -87,6 +87,20 @@ def test_of_a_world_whose_axes_are_known_a_strip_tells_the_place(cooling, tmp_pa
     assert (found[1] - found[0] - torch.tensor([-3.353, 199.97, 0.0])).abs().max() < 0.1
 
 
+def test_heights_are_of_the_column_that_has_them(cooling, tmp_path):
+    """A preparation writes both columns of heights, empty where the camera's files do not say one, or neither."""
+    scene = strip(cooling.module.scene)
+    path = table(scene, tmp_path / "frames.csv", degrees=0.0)
+    expected = place_of(scene, path)(torch.zeros(1, 3))
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([f"{head},above_takeoff_m", *(f"{row}," for row in rows)]))
+    assert torch.allclose(place_of(scene, path)(torch.zeros(1, 3)), expected)
+    path.write_text("\n".join([f"{head},above_takeoff_m", *(f"{row.rpartition(',')[0]},," for row in rows)]))
+    assert torch.allclose(place_of(scene, path)(torch.zeros(1, 3))[:, :2], expected[:, :2])
+    with pytest.raises(SceneError, match="has positions of 0 of the images"):  # without axes heights tell the turn
+        place_of(replace(scene, notes={}), path)
+
+
 def test_decimetres_do_not_tip_a_world_whose_axes_are_known(cooling, tmp_path):
     scene = strip(cooling.module.scene, wander=0.2)
     path = table(scene, tmp_path / "frames.csv", degrees=0.0)

@@ -131,7 +131,7 @@ def upright(moment: Moment) -> tuple[Tensor, Tensor, Tensor]:
 
 def _placed(scene: SceneData, path: Path) -> Place:
     """By the shift, or else the similarity, that brings the cameras closest to their positions."""
-    positions = _positions(path)
+    positions = _positions(path, flat=_east_north_up(scene))
     found = {
         frame.camera.center: positions[name]
         for frame, name in zip(scene.frames, _named(scene.frames, positions), strict=True)
@@ -210,8 +210,12 @@ def _named(frames: Sequence[Frame], positions: Mapping[str, Any]) -> list[str | 
     return found
 
 
-def _positions(path: Path) -> dict[str, tuple[float, float, float]]:
-    """Latitude, longitude and height by name without ending; rows without a position are left out."""
+def _positions(path: Path, flat: bool = False) -> dict[str, tuple[float, float, float]]:
+    """Latitude, longitude and height by name without ending; rows without a position are left out.
+
+    Heights are those of the first column that has any: a preparation writes a column for each kind, empty where files do not
+    say it. ``flat`` takes 0 where none has.
+    """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             head = file.readline()
@@ -221,14 +225,16 @@ def _positions(path: Path) -> dict[str, tuple[float, float, float]]:
         raise SceneError(f"{path} cannot be read: {error}") from error
     columns = []
     for wanted in (NAMES, LATITUDES, LONGITUDES, HEIGHTS):
-        there = next((name for name in wanted if rows and name in rows[0]), None)
-        if there is None:
+        there = [name for name in wanted if rows and name in rows[0]]
+        filled = [name for name in there if any(row[name] for row in rows)]
+        if not there and not (flat and wanted is HEIGHTS):
             raise SceneError(f"{path} has no column {' or '.join(wanted)}")
-        columns.append(there)
+        if filled or not (flat and wanted is HEIGHTS):
+            columns.append((filled or there)[0])
     name, *numbers = columns
     try:
         return {
-            Path(row[name]).with_suffix("").as_posix(): tuple(float(row[n].replace(",", ".")) for n in numbers)
+            Path(row[name]).with_suffix("").as_posix(): (*(float(row[n].replace(",", ".")) for n in numbers), 0.0)[:3]
             for row in rows
             if all(row[n] for n in numbers)
         }

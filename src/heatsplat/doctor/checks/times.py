@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import torch
 
-from heatsplat.doctor.base import Check, Finding, Material, some
+from heatsplat.doctor.base import Check, Finding, Material, by_numbers, some
 
 GAP = 12.0  # times the usual step; recordings by hand have steps up to 6 times it
 
@@ -17,7 +17,8 @@ def find(material: Material) -> list[Finding]:
     times = torch.tensor([float(t) for t in material.times_s], dtype=torch.float64)
     found = []
     lens = material.lenses or [0] * len(times)
-    by_name = sorted(range(len(times)), key=lambda i: (lens[i], material.names[i]))  # each camera has names of its own
+    # Each camera has names of its own.
+    by_name = sorted(range(len(times)), key=lambda i: (lens[i], by_numbers(material.names[i])))
     back = [
         material.names[after]
         for before, after in pairwise(by_name)
