@@ -123,7 +123,8 @@ def build_module(config: dict[str, Any], output_dir: Path) -> SplatTraining:
 def build_trainer(trainer: Mapping[str, Any], watching: Mapping[str, Any], output_dir: Path) -> Any:
     """The trainer of a configuration, with the callbacks and loggers of ``watching``, which write into the run's folder."""
     callbacks = build_callbacks(watching["callbacks"], output_dir)
-    places = {"default_root_dir": str(output_dir), "plugins": [CheckpointFiles()]}
+    plugins = [*(trainer.get("plugins") or ()), CheckpointFiles()]
+    places = {"default_root_dir": str(output_dir), "plugins": plugins}
     built = build(
         dict(trainer), callbacks=callbacks, logger=build_loggers(watching.get("logger"), output_dir), **places
     )
