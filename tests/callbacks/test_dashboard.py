@@ -5,11 +5,12 @@ import re
 from itertools import chain
 
 from fake_run import FakeModule, events, fit, trainer, wall
+from pytorch_lightning.loggers import CSVLogger
 from running import TINY, run
 
 from heatsplat.callbacks.dashboard import LAYOUT, Dashboard
 from heatsplat.composition import compose
-from heatsplat.runs.run import begin
+from heatsplat.runs.run import begin, build_loggers
 from heatsplat.training.session import fit as training_fit
 
 
@@ -34,6 +35,26 @@ def test_runs_with_other_loggers_write_their_numbers(tmp_path):
     begun = begin(config, both)
     training_fit(begun.module, begun.data, begun.trainer, test=False)
     assert (both / "logs" / "metrics.csv").exists() and "loss/total" in events(both).Tags()["scalars"]
+
+
+class Elsewhere(CSVLogger):
+    """A logger that knows by itself where it writes."""
+
+    def __init__(self, prefix: str = "") -> None:
+        super().__init__("elsewhere", prefix=prefix)
+
+
+class Board(CSVLogger):
+    """A logger that hands on what it is given."""
+
+    def __init__(self, **settings) -> None:
+        super().__init__(**settings)
+
+
+def test_a_logger_need_not_take_a_folder(tmp_path):
+    own, handed_on = ({"_target_": f"{__name__}.{kind.__name__}", "prefix": "a"} for kind in (Elsewhere, Board))
+    found = build_loggers({"own": own, "handed on": handed_on}, tmp_path)
+    assert [one.save_dir for one in found] == ["elsewhere", str(tmp_path)]
 
 
 def test_every_panel_finds_curves_of_a_real_run(tmp_path):

@@ -1,10 +1,15 @@
 """Settings that nothing asks for, parts that are not there, and kinds of lists and of settings by name: all with origin."""
 
+import sys
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+
 import pytest
 from helpers import ALL_METHODS
 
 from heatsplat.composition import build, compose
 from heatsplat.contracts import SceneError
+from heatsplat.losses.compose import LossTerm
 from heatsplat.runs.declared import check_declared, declared
 
 
@@ -112,3 +117,31 @@ def test_of_what_takes_any_setting_or_is_not_there_nothing_is_known():
     assert found.names == {"term", "weight", "schedule"}
     assert found.kinds == {"term": {"part"}, "weight": {"float"}, "schedule": {"part", "None"}}
     assert declared("pytorch_lightning.Trainer").kinds == {} != declared("pytorch_lightning.Trainer").names
+
+
+class Mine:
+    """Its annotations are classes, as in a file without ``from __future__ import annotations``."""
+
+    def __init__(
+        self,
+        term: LossTerm,
+        every: int = 1,
+        low: Sequence[float] = (),
+        sizes: list[int] | None = None,
+        weights: Mapping[str, float] | None = None,
+    ) -> None: ...
+
+
+def test_annotations_count_whether_they_are_evaluated_or_not(monkeypatch):
+    module = ModuleType("heatsplat.mine")
+    module.Mine = Mine
+    monkeypatch.setitem(sys.modules, "heatsplat.mine", module)
+    found = declared("heatsplat.mine.Mine")
+    assert found.kinds == {
+        "term": {"part"},
+        "every": {"int"},
+        "low": {"list"},
+        "sizes": {"list", "None"},
+        "weights": {"group", "None"},
+    }
+    assert found.within == {"low": {"float"}, "sizes": {"int"}, "weights": {"float"}}

@@ -4,11 +4,15 @@ import logging
 
 import pytest
 import torch
+from pytorch_lightning.plugins.environments import LightningEnvironment
 
+from heatsplat.composition import compose
 from heatsplat.contracts import SceneError
 from heatsplat.renderers import gsplat
 from heatsplat.runs import device
 from heatsplat.runs.device import device_of
+from heatsplat.runs.run import build_trainer
+from heatsplat.training.checkpoints import CheckpointFiles
 
 MISSING = "the CUDA renderer needs gsplat (No module named 'gsplat'). Install it"
 
@@ -78,3 +82,13 @@ def test_what_cannot_be_had_is_refused(machine, accelerator, backend, cuda, has_
     machine(cuda, has_gsplat)
     with pytest.raises(error, match=message):
         device_of(accelerator, {"backend": backend})
+
+
+def test_in_a_job_of_slurm_it_is_our_launcher_that_starts_a_run_again(monkeypatch, tmp_path):
+    """Lightning's handling of SLURM goes on with any hpc_ckpt_*.ckpt that it finds, whatever run wrote it."""
+    for name, value in {"SLURM_NTASKS": "1", "SLURM_JOB_NAME": "sweep", "SLURM_JOB_ID": "7"}.items():
+        monkeypatch.setenv(name, value)
+    config = compose(["method=3dgs", "trainer.accelerator=cpu"])
+    trainer = build_trainer(config["trainer"], {"callbacks": {}}, tmp_path)
+    assert isinstance(trainer._accelerator_connector.cluster_environment, LightningEnvironment)
+    assert isinstance(trainer.strategy.checkpoint_io, CheckpointFiles)

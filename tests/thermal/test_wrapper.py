@@ -286,3 +286,10 @@ def test_two_members_with_a_tensor_of_the_same_name_are_refused():
     model = Composed(Static(), companion=Static(channels=3, modality="rgb"))
     with pytest.raises(ValueError, match="call a tensor sh0: give one a prefix"):
         model.per_gaussian(Seeds(torch.zeros(2, 3), torch.rand(2, 4), torch.Generator()))
+
+
+def test_two_members_with_a_loss_term_of_the_same_name_are_refused():
+    """Added up by name, one would be lost."""
+    model = ThroughAir(ThroughAir(Static(), Attenuation(moments=3, smooth=1.0)), Attenuation(moments=3, smooth=1.0))
+    with pytest.raises(ValueError, match="two members of ThroughAir call a loss term extinction_smooth"):
+        model.regularisers(None)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from numbers import Real
-from typing import Any
+from typing import Any, get_args
 
 from heatsplat.composition import choices_of, overlap, setters_of
 from heatsplat.contracts import SceneError
@@ -22,7 +22,14 @@ from heatsplat.io.settings import walk
 # Kinds of settings by the names that classes declare them with, in words. A class of ours, and what is called, is a part.
 KINDS = {"float": "a number", "int": "a whole number", "bool": "true or false", "list": "a list"}
 KINDS |= {"group": "settings by name", "part": "settings with a _target_", "None": "null"}
-HOLDERS = {"Sequence": "list", "Collection": "list", "tuple": "list", "Mapping": "group", "dict": "group"}
+HOLDERS = {
+    "list": "list",
+    "Sequence": "list",
+    "Collection": "list",
+    "tuple": "list",
+    "Mapping": "group",
+    "dict": "group",
+}
 PART, OR_NULL = frozenset({"part"}), frozenset({"None"})
 
 
@@ -75,7 +82,7 @@ def declared(target: str) -> Declared:
         return Declared(names=names)  # others may not mean what they declare
     makers = [vars(base).get("__init__") for base in reversed(found.__mro__)] if isinstance(found, type) else [found]
     hints = {
-        name: _kinds(str(hint), getattr(maker, "__globals__", {}))
+        name: _kinds(_spelled(hint), getattr(maker, "__globals__", {}))
         for maker in makers
         for name, hint in getattr(maker, "__annotations__", {}).items()
         if name != "return"
@@ -83,6 +90,12 @@ def declared(target: str) -> Declared:
     kinds = {name: one for name, (one, _) in hints.items() if one <= KINDS.keys()}
     within = {name: one for name, (_, one) in hints.items() if name in kinds and one and one <= KINDS.keys()}
     return Declared(kinds, within, names)
+
+
+def _spelled(hint: Any) -> str:
+    """A type hint as it stands in the source, where annotations may be evaluated or not: of dotted names the last part."""
+    written = hint.__name__ if isinstance(hint, type) and not get_args(hint) else str(hint)
+    return re.sub(r"\b(?:\w+\.)+(?=\w)", "", written)
 
 
 def _kinds(hint: str, scope: Mapping[str, Any]) -> tuple[frozenset[str], frozenset[str]]:

@@ -25,6 +25,7 @@ from heatsplat.geometry.coverage import Sighting, covered
 from heatsplat.io.results import RunResults
 from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import check_last_stage, checked
+from heatsplat.runs.declared import declared
 from heatsplat.runs.device import device_of
 from heatsplat.runs.folder import results_in
 from heatsplat.runs.lock import locked
@@ -122,7 +123,8 @@ def build_module(config: dict[str, Any], output_dir: Path) -> SplatTraining:
 def build_trainer(trainer: Mapping[str, Any], watching: Mapping[str, Any], output_dir: Path) -> Any:
     """The trainer of a configuration, with the callbacks and loggers of ``watching``, which write into the run's folder."""
     callbacks = build_callbacks(watching["callbacks"], output_dir)
-    places = {"default_root_dir": str(output_dir), "plugins": [CheckpointFiles()]}
+    plugins = [*(trainer.get("plugins") or ()), CheckpointFiles()]
+    places = {"default_root_dir": str(output_dir), "plugins": plugins}
     built = build(
         dict(trainer), callbacks=callbacks, logger=build_loggers(watching.get("logger"), output_dir), **places
     )
@@ -131,11 +133,17 @@ def build_trainer(trainer: Mapping[str, Any], watching: Mapping[str, Any], outpu
 
 
 def build_loggers(logger: Mapping[str, Any] | Sequence[Any] | None, output_dir: Path) -> list[Any]:
-    """The loggers of a configuration: of one, of a list or of a mapping of several by name."""
+    """The loggers of a configuration: of one, of a list or of a mapping of several by name. Those that take a ``save_dir`` write
+    into the run's folder."""
     if not logger:
         return []
     several = [logger] if "_target_" in logger else logger.values() if isinstance(logger, Mapping) else logger
-    return [build({**settings, "save_dir": str(output_dir)}) for settings in several if settings is not None]
+
+    def placed(settings: Mapping[str, Any]) -> dict[str, Any]:
+        names = declared(str(settings["_target_"])).names
+        return {**settings, "save_dir": str(output_dir)} if names is None or "save_dir" in names else dict(settings)
+
+    return [build(placed(settings)) for settings in several if settings is not None]
 
 
 def build_callbacks(callbacks: Mapping[str, Any], output_dir: Path) -> list[Any]:

@@ -147,7 +147,20 @@ class Wrapper(ThermalModel):
             member.on_step(step)
 
     def regularisers(self, splats: Splats) -> dict[str, Tensor]:
-        return _merged(member.regularisers(splats) for member in self.members.values())
+        """Those of all members.
+
+        Raises:
+            ValueError: two members have terms of the same name, of which one would be lost.
+        """
+        terms: dict[str, Tensor] = {}
+        for member in self.members.values():
+            found = member.regularisers(splats)
+            if twice := ", ".join(sorted(terms.keys() & found.keys())):
+                raise ValueError(
+                    f"two members of {type(self).__name__} call a loss term {twice}: give one another name"
+                )
+            terms |= found
+        return terms
 
     def rows_to_drop(self, splats: Splats, step: int) -> Iterator[tuple[str, Tensor, Mapping[str, Tensor]]]:
         for member in self.members.values():
