@@ -30,6 +30,7 @@ GAUSSIANS = {  # 3D Gaussian Splatting, arguments/__init__.py of the authors' co
     "optim.accumulate": (1, "train.py: optimizer.step in every iteration"),
     "optim.averaged": (0, "train.py: what the last iteration left is saved"),
     "optim.eps": (1e-15, "training_setup"),
+    "renderer.background": (0.0, "train.py: bg_color is black unless --white_background"),
     "init.opacity": (0.1, "create_from_pcd"),
     "init.scale": (1.0, "create_from_pcd: the distance to three neighbours"),
 }
