@@ -150,6 +150,21 @@ def test_scaling_coefficients_leaves_the_constant_half_alone():
     assert not torch.allclose(printed, factor * emitted, atol=1e-3)
 
 
+def test_what_is_printed_is_cut_off_after_coefficients_were_scaled():
+    """Eq. 12 weakens what lies below zero, too: as published, a Gaussian with a negative sum may show."""
+    model, splats = make(disturb=0.3, emission=Static(floor=False), applies_to="harmonics")
+    with torch.no_grad():
+        splats["sh0"][:25] -= 3.0
+    sums = 0.28209479177387814 * splats["sh0"][:, 0]
+    factor = model.factor(splats.means, query())[:, None]
+    printed = (sums * factor + 0.5).clamp(min=0)
+    assert ((sums < -0.5) & (printed > 0)).any()
+    emitted = model.features(splats, query())
+    assert torch.allclose(emitted, printed, atol=1e-6)
+    emitted.sum().backward()
+    assert (splats["sh0"].grad[:, 0][printed > 0] > 0).all()
+
+
 def test_time_changes_the_factor_and_can_be_absent():
     model, splats = make(disturb=0.3)
     assert not torch.allclose(

@@ -6,7 +6,7 @@ import mpmath
 import pytest
 import torch
 
-from heatsplat.contracts import Camera, SceneError
+from heatsplat.contracts import Camera, SceneError, ThermalRange
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.physics.grey_body import radiance, temperature_of
@@ -307,6 +307,16 @@ def test_with_what_was_measured_emission_starts_at_the_seed_values(room, options
 def test_measured_surroundings_need_a_measurement(room):
     with pytest.raises(SceneError, match="thermal.surroundings=measured needs the ambient temperature"):
         model(surroundings="measured").prepare(replace(room, ambient_c=None))
+
+
+def test_surroundings_that_are_mirrored_white_leave_no_gain(room):
+    """A narrow range far below the room: ρ L above 1 had made the gain, and with it all emission, NaN."""
+    narrow = replace(room, thermal_range=ThermalRange(20.0, 20.5), ambient_c=26.0)
+    with pytest.raises(SceneError, match="reflect 0.1 of surroundings at an image value of 12 are white"):
+        model(surroundings="measured").prepare(narrow)
+    thermal = model(surroundings="measured", gain=1.0)
+    thermal.prepare(narrow)
+    assert thermal.gain.item() == pytest.approx(1.0)
 
 
 def test_plancks_law_is_for_opaque_bodies():

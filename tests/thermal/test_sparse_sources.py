@@ -184,10 +184,11 @@ def test_the_closest_relaxation_is_found():
     assert relaxation_of(torch.sin(9 * times)[:, None], times)[2] > 0.3
 
 
-def scene(noise=0.002):
+def scene(noise=0.002, first_s=0.0):
     generator = torch.Generator().manual_seed(3)
     camera = Camera(torch.eye(4), torch.eye(3), 40, 40)
-    frames = [Frame(f"{i}.png", i, camera, time) for i, time in enumerate(torch.linspace(0, SPAN_S, 81).tolist())]
+    times = first_s + torch.linspace(0, SPAN_S, 81)
+    frames = [Frame(f"{i}.png", i, camera, time) for i, time in enumerate(times.tolist())]
     ramp = torch.linspace(0.2, 0.8, 40)[:, None] * torch.ones(40)
     images = [(ramp + noise * torch.randn(40, 40, generator=generator))[..., None].float() for _ in frames]
     views = ViewSet(frames, lambda i: View(frames[i], thermal=images[i]))
@@ -200,11 +201,12 @@ def test_the_noise_is_that_of_the_camera():
     assert sources.noise == pytest.approx(0.002, rel=0.1)
 
 
+@pytest.mark.parametrize("first_s", [0.0, 300.0])
 @pytest.mark.parametrize("param", ["rate", "faithful"])
-def test_sources_go_where_relaxation_tells_the_same(param):
+def test_sources_go_where_relaxation_tells_the_same(param, first_s):
     """Three bodies: one driven, one whose source is nothing, one whose source makes up for a wrong rate."""
     model = NewtonHarmonic(param=param, drop_sources_at=[5], source_noise=0.002, source_floor=2.0)
-    model.prepare(scene())
+    model.prepare(scene(first_s=first_s))
     initial = torch.tensor([0.5, 0.5, 0.9])
     gains = torch.zeros(3, 2, len(model.omega))
     gains[0, 0, 2] = 3.0
@@ -216,7 +218,7 @@ def test_sources_go_where_relaxation_tells_the_same(param):
     splats = Splats(tensors | rates)
     times = model.sources.times_s
     with torch.no_grad():  # a source that, together with its rate, gives the course of another rate
-        wanted = model.ambient + (0.9 - model.ambient) * torch.exp(-1.7 * torch.tensor(times) / SPAN_S)
+        wanted = model.ambient + (0.9 - model.ambient) * torch.exp(-1.7 * (torch.tensor(times) - first_s) / SPAN_S)
         unit = torch.eye(2 * len(model.omega)).reshape(-1, 2, len(model.omega))
         columns = []
         for one in unit:

@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 LOWEST_HZ = 1e-5  # ETGS Eq. 27
 SAME_MOMENT_S = 1e-6  # timestamps closer than this are one moment: clocks since 1970 in float64 resolve 2e-7 s
 NARROWEST_BAND = 1.2  # the highest frequency is at least this times the lowest (ETGS Eq. 34)
-SEPARATION = 0.5  # cycles over the record by which frequencies differ at least (the authors' code; the text has none)
+SEPARATION = 0.5  # cycles over the record by which frequencies differ at least (the authors' code; the text: no number)
 
 
 def default_tau_min(timestamps: Tensor) -> float:
@@ -44,7 +44,7 @@ def frequency_grid(
         count: how many frequencies to ask for, at least 0.
         tau_min: shortest time constant in seconds, above 0 (see ``default_tau_min``).
         gain: steady-state amplitude in (0, 1] below which a frequency is not worth having; α of the paper.
-        separation: cycles over the span by which neighbours differ at least; 0 removes equal ones alone (the text).
+        separation: cycles over the span by which neighbours differ at least; 0 removes equal ones alone (App. B).
 
     Raises:
         ValueError: a timestamp is not finite, or count, tau_min, gain or separation lies outside its range.

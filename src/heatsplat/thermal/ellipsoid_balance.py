@@ -1,4 +1,4 @@
-"""The balance of heat of Gaussians that are solid ellipsoids under sun, air and sky (ThermoGS, Eq. 3-8)."""
+"""The balance of heat of Gaussians that are solid ellipsoids under sun, air and sky (ThermoGS, Eq. 2-9)."""
 
 from __future__ import annotations
 

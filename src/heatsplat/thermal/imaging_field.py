@@ -26,7 +26,8 @@ class ImagingField(AtmosphericField):
     Args:
         emission: what splats emit before anything weakens it.
         applies_to: "radiance" multiplies what is emitted; "harmonics" multiplies the coefficients, as the paper prints
-            (Eq. 12), which leaves the constant 1/2 of an emission as it is. The same where emission was above zero.
+            (Eq. 12), which leaves the constant 1/2 of an emission as it is. Values that the emission cut off below zero
+            count as zero before they are multiplied; with ``Static``, floor=False cuts off only after that, as printed.
         gauge: weight of the penalty (mean R in view - 1)², which keeps the level with the emission.
         exponent: as in ``AtmosphericField``; "positive" also keeps R within (0, 2) by 2 sigmoid. The paper prints no
             constraint, and learns faster for it.

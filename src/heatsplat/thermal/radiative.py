@@ -148,7 +148,14 @@ class Radiative(Wrapper):
     @torch.no_grad()
     def _set_white(self) -> None:
         if self._white:
-            gain = (1.0 - self.reflectance * self.surroundings) / (self.emissivity * START[1] ** 4)
+            mirrored = self.reflectance * self.surroundings
+            if not mirrored < 1.0:
+                raise SceneError(
+                    f"surfaces that reflect {self.reflectance:g} of surroundings at an image value of {self.surroundings:.3g} "
+                    "are white before they emit, so that no gain makes T = 0.98 white: give thermal.gain, a smaller "
+                    "thermal.reflectance_start, or the scene a range of temperatures that its surroundings are nearer to"
+                )
+            gain = (1.0 - mirrored) / (self.emissivity * START[1] ** 4)
             self.raw_gain.copy_(gain.expm1().log())
 
     # What the contract asks -----------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from heatsplat.thermal.part import HeatPart
 
 
 class Reflection(HeatPart):
-    """(1 - ρ) x + ρ L of what a surface emits: Kirchhoff's law for an opaque body (RaViGS, Eq. 4, with ρ = 1 - ε).
+    """(1 - ρ) x + ρ L of what a surface emits: Kirchhoff's law for an opaque body (RaViGS, Eq. 5, with ρ = 1 - ε).
 
     The radiance L of the surroundings belongs to the scene: spherical harmonics of the direction in which the line of
     sight goes on after it met the surface, with its normal (``Query.normals``). At degree 0 it is one

@@ -73,7 +73,8 @@ class SparseSources:
             span_s: unit of time of rates.
         """
         above = torch.stack([temperature(time) for time in self.times_s]).double() - ambient.double()
-        times = torch.tensor(self.times_s, dtype=torch.float64, device=above.device) / span_s
+        times = torch.tensor(self.times_s, dtype=torch.float64, device=above.device)
+        times = (times - times[0]) / span_s  # the initial state is that of the first training image
         results = [relaxation_of(part, times) for part in above.split(CHUNK, dim=1)]
         start, rate, error = (torch.cat(parts) for parts in zip(*results, strict=True))
         return error <= self.floor * self.noise, (start + ambient).float(), rate.log().float()

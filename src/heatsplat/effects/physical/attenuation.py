@@ -102,7 +102,7 @@ EFFECT = Effect(
     stage="path",
     place=0,
     summary="air that absorbs radiation over distance and emits its own",
-    source="TI-3DGS, Eq. 6; Beer and Lambert",
+    source="TI-3DGS, Eq. 8; Beer and Lambert",
     null="a point looks the same from near and far",
     # Up to 0.9 without it; from 30 with it, and 0 once, where haze passes for heat.
     threshold=SHARED_HURDLE,

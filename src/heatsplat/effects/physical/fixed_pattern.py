@@ -73,7 +73,7 @@ EFFECT = Effect(
     stage="sensor",
     place=3,
     summary="uneven gain and offset of the pixels",
-    source="SupIR-GS, Eq. 4",
+    source="SupIR-GS, Eq. 6",
     null="residuals average to zero at every image position",
     # All points share it, but how courses of points err looks like a pattern on heated scenes: it has gained 1.7 there.
     # Up to 1.2 without it, from 6.0 with it.

@@ -79,7 +79,7 @@ EFFECT = Effect(
     stage="state",
     place=1,
     summary="heat sources that are switched on and off: one course that all points answer, or K harmonics of each",
-    source="ETGS, Eq. 4, 7, 8; a common course: ours",
+    source="ETGS, Eq. 6-8; a common course: ours",
     needs=frozenset({"time"}),
     null="all changes are mixtures of relaxations",
     # Up to 1.3 without it, and 5.0 once, in haze; from 3.4 with it. Of points that something passes: up to 1.5 and from 5.0.

@@ -37,7 +37,7 @@ EFFECT = Effect(
     stage="emission",
     place=1,
     summary="mirror reflection of the surroundings",
-    source="RaViGS, Eq. 4",
+    source="RaViGS, Eq. 5",
     null="view dependence does not follow the reflected ray",
     # Up to 1.0 without it, from 10 with it.
     threshold=SHARED_HURDLE,

@@ -101,7 +101,7 @@ EFFECT = Effect(
     stage="sensor",
     place=4,
     summary="falloff of the lens towards the corners",
-    source="SupIR-GS, Eq. 6",
+    source="SupIR-GS, Eq. 4",
     null="residuals do not depend on the distance from the image centre",
     # Up to 0.3 without it, from 0.4 with it: beside a heat source it is missed.
     threshold=SHARED_HURDLE,
