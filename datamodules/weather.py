@@ -272,6 +272,11 @@ def _with_sun(
     else:
         columns["irradiance_w_m2"] = clear_sky(site, fine)
         notes["irradiance"] = "none in the record: that of a cloudless sky (Ineichen and Perez)"
+        if "clouds" in columns:
+            columns["irradiance_w_m2"] = columns["irradiance_w_m2"] * (1.0 - columns["clouds"])
+            notes["irradiance"] = (
+                "none in the record: that of a cloudless sky (Ineichen and Perez) less what its clouds take"
+            )
     direct, diffuse = split_irradiance(site, fine, columns["irradiance_w_m2"])
     taken = None if "clouds" in columns or not measured else clouds(site, fine, columns["irradiance_w_m2"])
     if taken is not None:

@@ -25,7 +25,7 @@ from heatsplat.datamodules.synthetic_scene.shapes import Box, Plane
 from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C
 from heatsplat.training.rng import generator_for
 
-NIGHT_S = (19.7 * 3600.0, 27.4 * 3600.0)  # from sunset to sunrise
+NIGHT_S = (19.7 * 3600.0, 27.4 * 3600.0)  # from half an hour after sunset to 20 minutes before sunrise
 # Weather before the record, so that its start finds the surfaces in the middle of things and not at one temperature.
 _BEFORE_S = 0.5 * DAY_S
 

@@ -203,6 +203,14 @@ def test_a_record_tells_clouds_by_its_cover_or_by_its_light(table):
         read_weather(table("utc,cloud_cover_percent", *day("120")))
 
 
+def test_recorded_clouds_take_their_share_of_light_that_was_not_measured(table):
+    clear = read_weather(table("utc,air_c", *day("15")), site=SITE)
+    dull = read_weather(table("utc,air_c,cloud_cover_oktas", *day("15,8")), site=SITE)
+    torch.testing.assert_close(dull.irradiance_w_m2, 0.25 * clear.irradiance_w_m2)
+    assert dull.direct_w_m2.max() < 0.1 * clear.direct_w_m2.max()  # the light that is left comes from all over the sky
+    assert "clouds take" in dull.notes["irradiance"] and "clouds" not in clear.notes["irradiance"]
+
+
 def test_rain_is_a_rate_or_what_fell_since_the_sample_before(table):
     by_rate = read_weather(table("utc,rain_mm_h", *day("2.5")))
     assert (by_rate.rain_mm_h == 2.5).all()

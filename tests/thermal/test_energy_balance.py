@@ -139,6 +139,20 @@ def test_what_stands_around_takes_sun_and_sky_and_the_ground_gives_some_back(sol
         ready(scene(weather(sun=None)), shadows=True)
 
 
+@pytest.mark.parametrize("solution", ["linear", "corrected"])
+def test_shadows_of_a_sun_that_never_rises_change_nothing(solution):
+    record = weather()
+    low = record.sun - 2.0 * record.sun[:, 2:].clamp(min=0.0) * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    none = torch.zeros(73, dtype=torch.float64)
+    night = scene(replace(record, sun=low, irradiance_w_m2=none, direct_w_m2=none, diffuse_w_m2=none))
+    model, splats = ready(night, solution=solution, shadows=True)
+    plain, open_splats = ready(night, solution=solution)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            model.temperature(splats, 12 * HOUR), plain.temperature(open_splats, 12 * HOUR), atol=1e-4, rtol=0
+        )
+
+
 def test_effects_that_are_off_or_unknown_are_absent():
     model, splats = ready(sky=None, wind=False, sun=False)
     assert set(splats.names) & {"raw_share", "raw_sun", "raw_wind"} == set()

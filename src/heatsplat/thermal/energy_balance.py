@@ -36,7 +36,7 @@ from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.coordinates import ImageRange
 from heatsplat.thermal.surface_drivers import drivers_of
 
-SUN_LIMIT = 200.0  # K m²/kW: a black surface that loses heat by half of its own radiation alone
+SUN_LIMIT = 200.0  # K m²/kW: a black surface at 8 °C that loses heat by its own radiation alone
 SHARE_LIMITS = (0.02, 0.98)  # of radiation in the exchange: where attributes divide by it or by the rest
 WIND_LIMITS = (0.0, 0.95)  # of wind in convection: in a calm something is left
 START_SHARE, START_WIND = 0.4, 0.4  # e = 0.9 beside 8 W/(m² K), of which a light breeze makes 40 %
