@@ -107,11 +107,17 @@ class Board:
         only = (self.protocol.get("only") or {}).get(method)
         return None if only is None or scene in only["scenes"] else only["why"]
 
+    def image(self, method: str, scene: str) -> str:
+        """Which image a method hands in of a scene: "clean" is the one before its sensor, "thermal" the one behind it."""
+        if method in (self.protocol.get("recorded") or {}):
+            return "thermal"
+        return self.protocol["scenes"].get(scene, {}).get("hand_in", "thermal")
+
     def jobs(self, given: Sequence[str] = ()) -> list[list[str]]:
         """Overrides of every run, those of the command line first; all methods and scenes with one seed before the next."""
         if not self.train:
             return []
-        own, of_scene = self.protocol.get("overrides") or {}, self.protocol["scenes"]
+        own = self.protocol.get("overrides") or {}
         return [
             [
                 f"method={method}",
@@ -121,7 +127,7 @@ class Board:
                 f"seed={seed}",
                 *self.protocol["tracks"][track],
                 *own.get(method, ()),
-                f"callbacks.temperatures.image={of_scene.get(scene, {}).get('hand_in', 'thermal')}",
+                f"callbacks.temperatures.image={self.image(method, scene)}",
                 f"leaderboard.track={track}",
                 f"row='{method}'",
                 *given,
