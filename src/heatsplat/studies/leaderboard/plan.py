@@ -32,6 +32,7 @@ class Submission:
         method, track: what they are of.
         command: where the code is, in place of a command line.
         scores: scene -> its score.
+        seed: of the run that made them; None where it is not told.
     """
 
     folder: Path
@@ -39,6 +40,7 @@ class Submission:
     track: str
     command: str
     scores: Mapping[str, SceneScore]
+    seed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -212,4 +214,4 @@ def _submission(folder: Path, board: Board, known: Collection[str]) -> Submissio
             f'{where}: "track" is {track}; this board has {", ".join(board.tracks)}. Name one of them there, or leave the '
             "folder out of leaderboard.submissions"
         )
-    return Submission(folder, method, track, str(told.get("code", "a submission")), scores)
+    return Submission(folder, method, track, str(told.get("code", "a submission")), scores, told.get("seed"))
