@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from boards import board, hand_in, protocol_folder, run_of
+from boards import board, hand_in, protocol_folder, run_of, submission
 
 from heatsplat.contracts import SceneError
 from heatsplat.studies.leaderboard.earlier import MARK, read_page
@@ -75,6 +75,26 @@ def test_seeds_of_a_page_and_of_later_runs_add_up(tmp_path):
         assert numbers_of_all(entry) == pytest.approx(numbers_of_all(wanted), rel=1e-6)
     rows = (then / "leaderboard.csv").read_text()
     assert rows.count("3dgs,cooling,steps") == 3  # a page, and the runs of two seeds
+
+
+def test_seeds_of_a_submission_add_up_as_those_of_runs_do(tmp_path):
+    root = protocol_folder(tmp_path / "root", "cooling")
+    theirs = [str(submission(tmp_path / f"theirs_{seed}", 1.0 + seed, seed=seed)) for seed in range(3)]
+    first, then = tmp_path / "first", tmp_path / "then"
+    for folder in (first, then):
+        folder.mkdir()
+
+    def seeds(folder, **asked):
+        (entry,) = (one for one in standings(folder, board(root, note="", **asked)).entries if one.seeds)
+        return sorted(entry.all_numbers), entry.mean("mae_c")
+
+    assert seeds(first, submissions=theirs) == ([0, 1, 2], pytest.approx(2.0, abs=1e-4))
+    write_leaderboard(first, board(root, note="", submissions=theirs[:1]))
+    page = str(first / "leaderboard.html")
+    assert seeds(then, submissions=theirs[1:], earlier=page) == ([0, 1, 2], pytest.approx(2.0, abs=1e-4))
+    assert seeds(then, submissions=[theirs[2], theirs[2]]) == ([2], pytest.approx(3.0, abs=1e-4))  # once each
+    unnumbered = [str(submission(tmp_path / f"again_{k}", off)) for k, off in enumerate((1.0, 2.0))]
+    assert seeds(then, submissions=unnumbered)[0] == [0, 1]
 
 
 def test_a_page_that_is_none_is_refused(tmp_path):

@@ -6,6 +6,7 @@ from omegaconf import OmegaConf
 from running import compose_run
 
 from heatsplat.contracts import SceneError
+from heatsplat.studies.leaderboard.plan import board_of
 
 
 def test_every_method_meets_every_scene_once_for_each_seed(tmp_path):
@@ -21,6 +22,24 @@ def test_every_method_meets_every_scene_once_for_each_seed(tmp_path):
     assert all("seed=0" in job for job in jobs[:7]) and all("seed=1" in job for job in jobs[7:])
     assert found.left_out("supirgs", "cooling").startswith("it is for low-resolution images")
     assert board(tmp_path, train=False).jobs() == []
+
+
+def test_an_image_is_handed_in_behind_a_sensor_that_is_no_flaw_of_the_camera(tmp_path):
+    methods = ["physir", "supirgs", "thermal3dgs", "3dgs"]
+    asked = {**ASKED, "root": str(protocol_folder(tmp_path, "coarse_camera", "cooling")), "methods": methods}
+    found = board_of(asked, methods)
+    images = {method: [found.image(method, scene) for scene in found.scenes] for method in methods}
+    assert found.scenes == ["cooling", "coarse_camera"]
+    assert images == {
+        "physir": ["thermal", "thermal"],
+        "supirgs": ["thermal", "clean"],
+        "thermal3dgs": ["thermal", "thermal"],
+        "3dgs": ["thermal", "clean"],  # has no sensor: they are one
+    }
+    for job in found.jobs():
+        (image,) = (text for text in job if text.startswith("callbacks.temperatures.image="))
+        method, scene = (next(t for t in job if t.startswith(key)).split("=")[1] for key in ("method=", "data.scene="))
+        assert image.endswith(f"={found.image(method, scene)}")
 
 
 def test_a_word_or_number_is_a_list_of_one(tmp_path):

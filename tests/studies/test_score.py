@@ -80,6 +80,7 @@ def test_a_submission_tells_its_method_and_its_scenes(root, submission, tmp_path
             '{"method": "ours", "scenes": {"cooling": {"seconds": -1}}}',
             "scenes.cooling.seconds is -1; a number of 0 or more",
         ),
+        ('{"method": "ours", "seed": "1", "scenes": {"cooling": {}}}', "\"seed\" is '1'; a whole number of 0 or more"),
         ('{"method": "ours", "scenes": {}}', 'needs "method": a name, and "scenes"'),
         ('{"method": "ours", "scenes": {"cooling": {"seconds": true}}}', "seconds is True; a number of 0 or more"),
         (

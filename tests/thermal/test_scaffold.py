@@ -97,6 +97,14 @@ def test_without_the_distance_nothing_changes_as_the_camera_comes_closer():
         Scaffold(gaussians=0)
 
 
+def test_an_anchor_learns_by_the_length_of_the_run_as_gaussians_do():
+    """All of it: the public code has one tensor for what are base sizes and reach here."""
+    points = torch.zeros(3, 3)
+    seeds = Seeds(points, points[:, :1], torch.Generator(), log_scales=points)
+    declared = Scaffold().per_gaussian(seeds)
+    assert set(declared) == {"feature", "offsets", "log_reach"} and all(item.paced for item in declared.values())
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scaffold")

@@ -10,8 +10,8 @@ from heatsplat.losses.compose import LossInputs, LossTerm, Weighted, scaled
 class ByOthersShare(Weighted):
     """A term times a weight times the share of Gaussians that belong to the other modalities (MSMG).
 
-    The modality with more Gaussians weighs less; with it shrink the screen gradients by which density control adds
-    Gaussians. A Gaussian belongs to the modality in which it is most opaque.
+    The modality with more Gaussians weighs less; with it shrink the screen gradients by which ``density=adaptive`` adds
+    Gaussians. Where those do not count, Adam undoes the weight. A Gaussian belongs to the modality in which it is most opaque.
 
     Args:
         term: what is weighted.

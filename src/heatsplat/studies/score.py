@@ -142,6 +142,9 @@ def read_submission(folder: Path) -> dict[str, Any]:
         raise SceneError(
             f'{path} needs "method": a name, and "scenes": {{name: {{"seconds": ..., "memory_mb": ..., "gaussians": ...}}}}'
         )
+    seed = told.get("seed")
+    if not (seed is None or (isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0)):
+        raise SceneError(f'{path}: "seed" is {seed!r}; a whole number of 0 or more, or leave it out')
     for scene, cost in told["scenes"].items():
         if not isinstance(cost, Mapping | None):
             raise SceneError(f'{path}: scenes.{scene} is {cost!r}; what it cost, {{"seconds": ...}}, or null')

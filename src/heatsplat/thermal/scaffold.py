@@ -107,11 +107,9 @@ class Scaffold(ThermalModel):
         draw_uniform((net[i] for net in self.networks.values() for i in (0, 2)), seeds.generator)
         count, size = len(seeds.means), self.networks["value"][2].in_features
         return {
-            "feature": PerGaussian(torch.zeros(count, size), self.rates["feature"], paced=False),
-            "offsets": PerGaussian(
-                torch.zeros(count, self.per_row, 3), self.rates["offsets"], lr_end=self.end_offsets, paced=False
-            ),
-            "log_reach": PerGaussian(seeds.log_scales.clone(), self.rates["log_reach"], paced=False),
+            "feature": PerGaussian(torch.zeros(count, size), self.rates["feature"]),
+            "offsets": PerGaussian(torch.zeros(count, self.per_row, 3), self.rates["offsets"], lr_end=self.end_offsets),
+            "log_reach": PerGaussian(seeds.log_scales.clone(), self.rates["log_reach"]),
         }
 
     def geometry(self, splats: Splats, query: Query) -> Geometry:

@@ -32,6 +32,7 @@ class Submission:
         method, track: what they are of.
         command: where the code is, in place of a command line.
         scores: scene -> its score.
+        seed: of the run that made them; None where it is not told.
     """
 
     folder: Path
@@ -39,6 +40,7 @@ class Submission:
     track: str
     command: str
     scores: Mapping[str, SceneScore]
+    seed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -107,11 +109,17 @@ class Board:
         only = (self.protocol.get("only") or {}).get(method)
         return None if only is None or scene in only["scenes"] else only["why"]
 
+    def image(self, method: str, scene: str) -> str:
+        """Which image a method hands in of a scene: "clean" is the one before its sensor, "thermal" the one behind it."""
+        if method in (self.protocol.get("recorded") or {}):
+            return "thermal"
+        return self.protocol["scenes"].get(scene, {}).get("hand_in", "thermal")
+
     def jobs(self, given: Sequence[str] = ()) -> list[list[str]]:
         """Overrides of every run, those of the command line first; all methods and scenes with one seed before the next."""
         if not self.train:
             return []
-        own, of_scene = self.protocol.get("overrides") or {}, self.protocol["scenes"]
+        own = self.protocol.get("overrides") or {}
         return [
             [
                 f"method={method}",
@@ -121,7 +129,7 @@ class Board:
                 f"seed={seed}",
                 *self.protocol["tracks"][track],
                 *own.get(method, ()),
-                f"callbacks.temperatures.image={of_scene.get(scene, {}).get('hand_in', 'thermal')}",
+                f"callbacks.temperatures.image={self.image(method, scene)}",
                 f"leaderboard.track={track}",
                 f"row='{method}'",
                 *given,
@@ -206,4 +214,4 @@ def _submission(folder: Path, board: Board, known: Collection[str]) -> Submissio
             f'{where}: "track" is {track}; this board has {", ".join(board.tracks)}. Name one of them there, or leave the '
             "folder out of leaderboard.submissions"
         )
-    return Submission(folder, method, track, str(told.get("code", "a submission")), scores)
+    return Submission(folder, method, track, str(told.get("code", "a submission")), scores, told.get("seed"))

@@ -9,6 +9,7 @@ import re
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +157,10 @@ def standings(folder: Path, board: Board) -> Standings:
         for scene, score in submission.scores.items():
             key = (submission.method, scene, submission.track)
             entry = places.setdefault(key, Entry(*key))
-            entry.runs.append(Result(entry.seeds, score, score.cost, submission.folder, submission.command))
+            taken = entry.all_numbers
+            seed = next(n for n in count() if n not in taken) if submission.seed is None else submission.seed
+            if seed not in taken:
+                entry.runs.append(Result(seed, score, score.cost, submission.folder, submission.command))
     note = ""
     if board.earlier is not None:
         for place, seeds in board.earlier.seeds.items():
