@@ -126,7 +126,9 @@ def test_hours_come_again_where_the_weather_goes_on_for_more_than_a_day():
         longer = replace(scene, weather=replace(weather, times_s=start + stretch * (weather.times_s - start)))
         model, _ = make(longer)
         assert model.effects()["relaxation"]["time"] == time
-    clock = [model._moment(moment)[-2 * model.options.time_frequencies :] for moment in (HOUR_S, 25 * HOUR_S, 13 * HOUR_S)]
+    clock = [
+        model._moment(moment)[-2 * model.options.time_frequencies :] for moment in (HOUR_S, 25 * HOUR_S, 13 * HOUR_S)
+    ]
     torch.testing.assert_close(clock[0], clock[1])
     assert not torch.allclose(clock[0], clock[2], atol=0.1)
 
