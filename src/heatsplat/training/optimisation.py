@@ -109,8 +109,8 @@ class Optimisation:
     def held(self, share: float) -> float:
         """Share of the run in which a rate stays that is held for ``share`` of the shortest: none of a run of the papers' length.
 
-        A rate that falls to a 500th by the papers' law is below a fifth of itself for three quarters of a run. Of 30,000 steps the
-        rest is enough, of 2,000 it is not (docs/presets.md).
+        A rate that falls to a 500th by the papers' law is below a fifth of itself for three quarters of a run. Of 30,000 steps
+        the rest is enough, of 2,000 it is not (docs/presets.md).
         """
         return share * (1 - self.pace**-2)
 
