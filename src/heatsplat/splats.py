@@ -102,15 +102,21 @@ class Splats(nn.Module):
         result[found >= 0] = rows[found[found >= 0]]
         return result
 
-    def resize(self, count: int) -> None:
-        """Gives every tensor ``count`` rows of zeros; for loading a checkpoint of another size, whose values follow."""
+    def resize(self, count: int, rows: Mapping[str, tuple[int, ...]] | None = None) -> None:
+        """Gives every tensor ``count`` rows of zeros; for loading a checkpoint of another size, whose values follow.
+
+        Args:
+            count: of Gaussians.
+            rows: shape of a row by name of the tensor, where it is another one, too.
+        """
         self._places = nn.Module()
         for name in self.names:
-            self._resize(name, count)
+            self._resize(name, count, (rows or {}).get(name))
 
-    def _resize(self, name: str, count: int) -> None:
+    def _resize(self, name: str, count: int, row: tuple[int, ...] | None = None) -> None:
         old = self.raw[name]
-        self.raw[name] = nn.Parameter(torch.zeros(count, *old.shape[1:], dtype=old.dtype, device=old.device))
+        row = tuple(old.shape[1:]) if row is None else row
+        self.raw[name] = nn.Parameter(torch.zeros(count, *row, dtype=old.dtype, device=old.device))
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Tensor], prefix: str, *rest) -> None:
         """Makes tensors sparse that are so in the checkpoint; what torch does follows."""

@@ -467,3 +467,40 @@ def test_shares_that_few_images_tell_do_not_learn_faster_in_shorter_runs(options
     paced = {name: item.paced for name, item in model.per_gaussian(seeds).items()}
     assert paced["raw_share"] is paced["raw_wind"] is follow
     assert paced["log_rate"] and paced["raw_sun"]
+
+
+@pytest.mark.parametrize("solution", ["linear", "corrected"])
+def test_in_another_weather_shadows_are_those_of_the_directions_that_were_looked_at(solution, caplog):
+    def striped(model):
+        return ((20 * model.climate.drivers.ways).sin().sum(1) > 0).float()
+
+    trained, splats = ready(shadows=True, solution=solution)
+    splats["sun_seen"].data[:] = striped(trained)
+    record = weather()
+    series = ("times_s", "air_c", "wind_m_s", "humidity_percent", "irradiance_w_m2", "direct_w_m2", "diffuse_w_m2", "sun")
+    later = scene(replace(record, **{name: getattr(record, name)[12:] for name in series}))  # from midnight on
+    model, own = ready(later, shadows=True, solution=solution)
+    assert not torch.equal(model.sun_ways, trained.sun_ways)  # the first sun is that of the morning, not of the evening
+    with torch.no_grad():
+        for name in own.names:
+            own[name].copy_(splats[name])
+        own["sun_seen"][:] = striped(model)
+        model.load_state_dict(trained.state_dict() | {"sun_ways": model.sun_ways})
+        truth = model.temperature(own, 9 * HOUR)
+        model.load_state_dict(trained.state_dict())
+        torch.testing.assert_close(model.temperature(splats, 9 * HOUR), truth, atol=1e-3, rtol=0)
+        assert (model.temperature(own, 9 * HOUR) - truth).abs().max() > 0.1  # columns of other directions tell
+        assert "shadows are those of the sun where it stood" not in caplog.text
+        lower = torch.nn.functional.normalize(record.sun + torch.tensor([0.0, -0.4, 0.0], dtype=torch.float64), dim=1)
+        model.under(weather(sun=lower))
+    assert "shadows are those of the sun where it stood during training, up to" in caplog.text
+
+
+def test_checkpoints_without_directions_of_the_sun_take_those_of_their_weather():
+    model, _ = ready(shadows=True)
+    before = model.sun_ways.clone()
+    state = model.state_dict()
+    del state["sun_ways"]
+    model.load_state_dict(state)
+    assert torch.equal(model.sun_ways, before)
+    assert "sun_ways" not in EnergyBalance().state_dict()

@@ -193,6 +193,8 @@ class EnergyBalance(ThermalModel):
         self.register_buffer("reference_k", torch.zeros((), dtype=torch.float64))
         if self.options.windy:
             self.register_buffer("mean_wind", torch.zeros((), dtype=torch.float64))
+        if self.options.shadows:
+            self.register_buffer("sun_ways", torch.zeros(0, 3, dtype=torch.float64))  # those of SUN_SEEN's columns
         self._weather: Weather | None = None
         self._moments: Tensor | None = None  # of training frames
         self._kept: Kept | None = None
@@ -223,7 +225,10 @@ class EnergyBalance(ThermalModel):
             SceneError: the record lacks a series that the model was trained with.
         """
         mean_wind = self.mean_wind.item() if self.options.windy else 0.0
-        drivers, self.simulated = drivers_of(weather, self.options, self.reference_k.item(), mean_wind)
+        ways = self.sun_ways.cpu() if self.options.shadows and len(self.sun_ways) else None
+        drivers, self.simulated = drivers_of(weather, self.options, self.reference_k.item(), mean_wind, ways)
+        if self.options.shadows and ways is None:
+            self.sun_ways = drivers.ways.to(self.reference_k.device)
         self._weather, self.climate = weather, Climate(drivers, self.options.semi_infinite)
         self._kept, self._course = Kept(self.climate, self._moments), None
 
@@ -432,6 +437,12 @@ class EnergyBalance(ThermalModel):
         if share:
             loss = loss + share * (power_excess(excess, drivers.reference_k) - mean(drivers.sky))
         return (loss / mean(light).clamp(min=1e-6)).clamp(*START_SUN).to(grey)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest) -> None:
+        """Checkpoints of before shadows kept their directions have those of their weather; what torch does follows."""
+        if self.options.shadows:
+            state_dict.setdefault(prefix + "sun_ways", self.sun_ways)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 def _live_on(model: EnergyBalance, _: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -21,6 +22,8 @@ from heatsplat.thermal.weather_drive import NO_CLOUDS
 
 log = logging.getLogger(__name__)
 
+FAR_DEGREES = 5.0  # from the nearest sun whose shadows are known: three weeks of a year, or twenty minutes
+
 
 class Contribution(NamedTuple):
     """What one part of the weather contributes.
@@ -35,7 +38,7 @@ class Contribution(NamedTuple):
 
 
 def drivers_of(
-    weather: Weather, options: BalanceOptions, reference_k: float, mean_wind: float
+    weather: Weather, options: BalanceOptions, reference_k: float, mean_wind: float, ways: Tensor | None = None
 ) -> tuple[Drivers, dict[str, dict[str, Any]]]:
     """What drives surfaces in a weather, and the effects that are simulated with what was left out of them.
 
@@ -43,6 +46,7 @@ def drivers_of(
         weather: a record with the temperature of the air.
         reference_k: temperature that drivers count from.
         mean_wind: of the record that the model was trained with in m/s; 0 without wind.
+        ways: [D, 3] directions of the sun for which it is known what it reaches; None: those of this weather.
 
     Raises:
         SceneError: the record lacks what an option needs.
@@ -53,7 +57,7 @@ def drivers_of(
         _air(weather, options, reference_k),
         _bodies(options, reference_k),
         light,
-        _surroundings(weather, options, up),
+        _surroundings(weather, options, up, ways),
         _sky(weather, options, reference_k, up),
         _wind(weather, options, mean_wind),
         # Last: its air replaces that of the record, for wet surfaces but not for the sky.
@@ -120,7 +124,7 @@ def _sunlight(weather: Weather, options: BalanceOptions) -> Contribution:
     return Contribution({"light": weather.irradiance_w_m2 / 1000.0}, {"solar": solar})
 
 
-def _surroundings(weather: Weather, options: BalanceOptions, up: Tensor | None) -> Contribution:
+def _surroundings(weather: Weather, options: BalanceOptions, up: Tensor | None, ways: Tensor | None) -> Contribution:
     """What comes of the scene's own geometry: shadows, sky that is hidden, light from the ground."""
     if options.surrounded and up is None:
         raise SceneError(
@@ -130,7 +134,14 @@ def _surroundings(weather: Weather, options: BalanceOptions, up: Tensor | None) 
     drivers: dict[str, Any] = {}
     effects: dict[str, dict[str, Any]] = {}
     if options.shadows:
-        drivers["ways"] = sun_directions(weather.sun, up)
+        drivers["ways"] = sun_directions(weather.sun, up) if ways is None else ways
+        shining = weather.sun[weather.direct_w_m2 > 0]
+        cosine = float((shining @ drivers["ways"].T).amax(1).min()) if len(shining) else 1.0
+        if cosine < math.cos(math.radians(FAR_DEGREES)):
+            log.warning(
+                "shadows are those of the sun where it stood during training, up to %.0f degrees from where this weather has it",
+                math.degrees(math.acos(max(cosine, -1.0))),
+            )
         effects["shadows"] = {"directions": len(drivers["ways"])}
     if options.sky_view:
         effects["sky_view"] = {"sky": "as far as it is open"}

@@ -438,12 +438,15 @@ class SplatTraining(SceneModel):
         """Gives every tensor the size that it has in the checkpoint, and takes over what is no tensor."""
         weights = checkpoint["state_dict"]
         check_same_method(self, checkpoint)
-        self.splats.resize(weights["splats.raw.means"].shape[0])
+        stored = {name: tuple(weights[f"splats.raw.{name}"].shape) for name in self.splats.names}
+        # What does not learn may have other columns under the weather of today: those of the checkpoint count.
+        still = {name: stored[name][1:] for name, item in self._declared.items() if item.lr == 0}
+        self.splats.resize(stored["means"][0], still)
         for name, buffer in list(self.named_buffers()):
-            stored = weights.get(name)
-            if stored is not None and stored.shape != buffer.shape:
+            given = weights.get(name)
+            if given is not None and given.shape != buffer.shape:
                 owner, _, leaf = name.rpartition(".")
-                setattr(self.get_submodule(owner), leaf, torch.empty_like(stored, device=buffer.device))
+                setattr(self.get_submodule(owner), leaf, torch.empty_like(given, device=buffer.device))
         own = checkpoint[CHECKPOINT_KEY]
         if self.schedule.load_state_dict(own["schedule"]):
             self.density.load_times(own.get("density_times", {}))
