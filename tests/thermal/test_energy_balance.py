@@ -477,7 +477,16 @@ def test_in_another_weather_shadows_are_those_of_the_directions_that_were_looked
     trained, splats = ready(shadows=True, solution=solution)
     splats["sun_seen"].data[:] = striped(trained)
     record = weather()
-    series = ("times_s", "air_c", "wind_m_s", "humidity_percent", "irradiance_w_m2", "direct_w_m2", "diffuse_w_m2", "sun")
+    series = (
+        "times_s",
+        "air_c",
+        "wind_m_s",
+        "humidity_percent",
+        "irradiance_w_m2",
+        "direct_w_m2",
+        "diffuse_w_m2",
+        "sun",
+    )
     later = scene(replace(record, **{name: getattr(record, name)[12:] for name in series}))  # from midnight on
     model, own = ready(later, shadows=True, solution=solution)
     assert not torch.equal(model.sun_ways, trained.sun_ways)  # the first sun is that of the morning, not of the evening
