@@ -82,7 +82,7 @@ def test_its_data_set_loads(copy, tmp_path):
     start = frames[0][0]
     for time_s, view in frames:
         celsius = scene.thermal_range.to_celsius(view.thermal[..., 0]).numpy()
-        np.save(tmp_path / f"{time_s - start:09.3f}.npy", celsius)
+        np.save(tmp_path / f"{time_s - start:.3f}.npy", celsius)
     np.savez(
         tmp_path / "cameras.npz",
         viewmats=np.stack([view.camera.viewmat.numpy() for _, view in frames]),
