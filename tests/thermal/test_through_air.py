@@ -36,7 +36,7 @@ def test_an_unknown_way_to_clip_is_refused():
 
 def test_a_run_finds_the_extinction_of_the_fog(tmp_path):
     module, _ = run(
-        tmp_path, *TINY, "method=through_air", "data.scene=fog", "max_steps=400", "sensor=none", "test=false"
+        tmp_path, *TINY, "method=through_air", "data.scene=fog", "max_steps=600", "sensor=none", "test=false"
     )
     extinction = module.thermal.air.extinction().item()
     assert extinction == pytest.approx(droplets(2.0), rel=0.25)
