@@ -27,7 +27,7 @@ from heatsplat.datamodules.formats.images import (
 )
 from heatsplat.datamodules.formats.radiometric import read_bytes
 from heatsplat.datamodules.timestamps import dji_time, instant, zone_of
-from heatsplat.doctor.base import by_numbers
+from heatsplat.io.files import by_numbers
 from heatsplat.preparation.devices import devices_of, listed
 from heatsplat.preparation.frame import ThermalFrame, frame_name
 from heatsplat.preparation.makers import RECORDS, exif_details, radiometric_frames

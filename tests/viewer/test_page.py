@@ -353,7 +353,11 @@ def test_what_turns_about_a_point_pins_no_probe(page):
     )
     target = page.execute_script("return viewer.target")
     canvas = page.find_element("id", "canvas")
-    ActionChains(page).move_to_element_with_offset(canvas, 40, 30).double_click().perform()
+    box = canvas.rect  # two clicks of a busy machine may come too late to be one double click: their count is stated
+    place = {"x": box["x"] + box["width"] / 2 + 40, "y": box["y"] + box["height"] / 2 + 30, "button": "left"}
+    for count in (1, 2):
+        for kind in ("mousePressed", "mouseReleased"):
+            page.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": kind, "clickCount": count, **place})
     assert page.execute_script(names) == before and page.execute_script("return viewer.target") != target
     ActionChains(page).move_to_element(canvas).click().perform()
     assert page.execute_script(names) == [*before[1:], str(int(before[-1]) + 1)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -250,11 +249,6 @@ def _lenses(frames: Sequence[Frame]) -> list[int]:
         for c in (frame.camera for frame in frames)
     ]
     return found if 1 < len(numbers) <= len(frames) / FRAMES_PER_LENS else []
-
-
-def by_numbers(name: str) -> list[str | int]:
-    """What names are sorted by so that "image 2" comes before "image 10"."""
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name))]
 
 
 def some(names: Sequence[str]) -> str:

@@ -28,6 +28,7 @@ log = logging.getLogger("heatsplat")
 # Columns of a table of positions, as preparation writes them and as others do.
 NAMES, LATITUDES, LONGITUDES = (SPELLINGS[key] for key in ("name", "latitude_deg", "longitude_deg"))
 HEIGHTS = ("above_takeoff_m", "altitude_m", "altitude", "rel_alt", "alt")
+LEVEL = "no height"  # column that stands for them where a table has none
 AUTO = "auto"
 LEAST_SPREAD = 0.1  # positions whose second extent is below this share of the first lie on a line
 AXES = "east, north, up"  # of a world whose axes preparation has set by GPS (``notes["axes"]``)
@@ -223,18 +224,23 @@ def _positions(path: Path, flat: bool = False) -> dict[str, tuple[float, float, 
             rows = list(csv.DictReader(file, delimiter=max(",;\t", key=head.count)))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SceneError(f"{path} cannot be read: {error}") from error
+    there = rows[0].keys() if rows else ()
+    filled = {column for column in there if any(row[column] for row in rows)}
     columns = []
     for wanted in (NAMES, LATITUDES, LONGITUDES, HEIGHTS):
-        there = [name for name in wanted if rows and name in rows[0]]
-        filled = [name for name in there if any(row[name] for row in rows)]
-        if not there and not (flat and wanted is HEIGHTS):
+        found = [column for column in wanted if column in there]
+        column = next((column for column in found if column in filled), None)
+        if column is None and flat and wanted is HEIGHTS:
+            for row in rows:
+                row[LEVEL] = "0"
+            column = LEVEL
+        elif not found:
             raise SceneError(f"{path} has no column {' or '.join(wanted)}")
-        if filled or not (flat and wanted is HEIGHTS):
-            columns.append((filled or there)[0])
+        columns.append(column or found[0])
     name, *numbers = columns
     try:
         return {
-            Path(row[name]).with_suffix("").as_posix(): (*(float(row[n].replace(",", ".")) for n in numbers), 0.0)[:3]
+            Path(row[name]).with_suffix("").as_posix(): tuple(float(row[n].replace(",", ".")) for n in numbers)
             for row in rows
             if all(row[n] for n in numbers)
         }

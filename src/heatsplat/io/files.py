@@ -1,11 +1,17 @@
-"""Files that are written as a whole or not at all, and read whatever is in them."""
+"""Files: their order by name, writing as a whole or not at all, and reading whatever is in them."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
+
+
+def by_numbers(name: str) -> list[str | int]:
+    """What names are sorted by so that "image 2" comes before "image 10"."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name))]
 
 
 def write_atomically(path: str | Path, content: str | bytes | memoryview) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
@@ -93,21 +94,16 @@ class Wrapper(ThermalModel):
         Raises:
             ValueError: two members have tensors of the same name.
         """
-        tensors: dict[str, PerGaussian] = {}
+        tensors: list[dict[str, PerGaussian]] = []
         channel = self.own_channels
         for member in self.members.values():
             own = seeds
             if isinstance(member, ThermalModel):
                 last = channel + sum(member.modality_channels)
                 own, channel = seeds.of(channel, last), last
-            found = member.per_gaussian(own)
-            if twice := ", ".join(sorted((tensors.keys() & found.keys()) - {NORMALS})):
-                raise ValueError(
-                    f"two members of {type(self).__name__} call a tensor {twice}: give one a prefix, such as "
-                    "thermal.companion.prefix=companion_"
-                )
-            tensors |= found
-        return tensors
+            tensors.append(member.per_gaussian(own))
+        remedy = "give one a prefix, such as thermal.companion.prefix=companion_"
+        return self._distinct(tensors, "a tensor", remedy, shared={NORMALS})
 
     def features(self, splats: Splats, query: Query) -> Tensor:
         image, *others = (model.features(splats, query) for model in self._models)
@@ -152,15 +148,8 @@ class Wrapper(ThermalModel):
         Raises:
             ValueError: two members have terms of the same name, of which one would be lost.
         """
-        terms: dict[str, Tensor] = {}
-        for member in self.members.values():
-            found = member.regularisers(splats)
-            if twice := ", ".join(sorted(terms.keys() & found.keys())):
-                raise ValueError(
-                    f"two members of {type(self).__name__} call a loss term {twice}: give one another name"
-                )
-            terms |= found
-        return terms
+        terms = [member.regularisers(splats) for member in self.members.values()]
+        return self._distinct(terms, "a loss term", "give one another name")
 
     def rows_to_drop(self, splats: Splats, step: int) -> Iterator[tuple[str, Tensor, Mapping[str, Tensor]]]:
         for member in self.members.values():
@@ -194,6 +183,15 @@ class Wrapper(ThermalModel):
     @property
     def cost(self) -> int:
         return sum(member.cost for member in self.members.values())
+
+    def _distinct(
+        self, parts: Sequence[dict[str, Any]], what: str, remedy: str, shared: Collection[str] = ()
+    ) -> dict[str, Any]:
+        """What all members have. Raises ValueError where two have something of one name, of which one would be lost."""
+        times = Counter(name for part in parts for name in part)
+        if twice := sorted(name for name, count in times.items() if count > 1 and name not in shared):
+            raise ValueError(f"two members of {type(self).__name__} call {what} {', '.join(twice)}: {remedy}")
+        return _merged(parts)
 
 
 def _images_of(model: ThermalModel) -> Iterator[tuple[str, int]]:

@@ -6,7 +6,8 @@ from itertools import pairwise
 
 import torch
 
-from heatsplat.doctor.base import Check, Finding, Material, by_numbers, some
+from heatsplat.doctor.base import Check, Finding, Material, some
+from heatsplat.io.files import by_numbers
 
 GAP = 12.0  # times the usual step; recordings by hand have steps up to 6 times it
 
