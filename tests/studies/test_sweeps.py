@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 import yaml
 from commands import succeeds
+from finished_runs import job
 from hydra.core.utils import JobReturn, JobStatus
 from running import compose_run
 
 from heatsplat.contracts import SceneError
-from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
+from heatsplat.io.results import FAILED, METRICS_FILE
 from heatsplat.runs.resume import NOT_LEARNED
 from heatsplat.studies.finished import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, read_runs, row_names, settings_of
 from heatsplat.studies.published.figures import quoted
@@ -21,21 +22,6 @@ from hydra_plugins.heatsplat_sweeper.rows import folder_name
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAIN = str(ROOT / "src" / "train.py")
-
-
-def job(folder: Path, number: int, overrides: list[str], psnr: float | None, **costs: float) -> Path:
-    """A job's folder as a run leaves it."""
-    path = folder / f"etgs_cooling_{number}_x"
-    (path / ".hydra").mkdir(parents=True)
-    (path / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(overrides))
-    (path / ".hydra" / "config.yaml").write_text(yaml.safe_dump({"data": {"scene": "cooling"}}))
-    if psnr is not None:
-        results = RunResults(run={"scene": "cooling"})
-        results.put("test", "psnr", psnr)
-        results.put("test", "mae_c", 40.0 - psnr)
-        results.put("cost", "train_seconds", costs.get("seconds", 10.0))
-        results.write(path / METRICS_FILE)
-    return path
 
 
 @pytest.fixture
@@ -229,10 +215,10 @@ class Remembering:
     def launch(self, job_overrides: list[list[str]], initial_job_idx: int) -> list[JobReturn]:
         self.batches.append((initial_job_idx, [" ".join(job) for job in job_overrides]))
         returned = [JobReturn(overrides=job, status=JobStatus.COMPLETED) for job in job_overrides]
-        for job in returned:
-            if job.overrides == ["seed=1"]:
-                job.status = JobStatus.FAILED
-                job.return_value = RuntimeError("no points")
+        for done in returned:
+            if done.overrides == ["seed=1"]:
+                done.status = JobStatus.FAILED
+                done.return_value = RuntimeError("no points")
         return returned
 
 

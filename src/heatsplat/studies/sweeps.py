@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +29,19 @@ COLUMNS = (
 Printed = Mapping[str, Mapping[str, str]]  # name of a row -> score or cost -> what a paper prints for it
 
 
-def write_sweep(folder: Path, order: Sequence[str] = (), paper: Printed | None = None) -> list[Path]:
+def write_sweep(
+    folder: Path,
+    order: Sequence[str] = (),
+    paper: Printed | None = None,
+    draw: Callable[[Sequence[Runs]], Figure | None] | None = None,
+) -> list[Path]:
     """Writes table.md, table.csv and table.png into a sweep's folder, and returns their paths; none without jobs.
 
     Args:
         folder: the sweep's folder, in which every job has its own.
         order: names of rows in the order of the table; others follow as they come.
         paper: what a paper prints for a row: name of row -> score or cost -> text.
+        draw: makes the picture of the rows, None without; quality against seconds if not given.
     """
     rows = collect(folder)
     if not rows:
@@ -45,7 +51,7 @@ def write_sweep(folder: Path, order: Sequence[str] = (), paper: Printed | None =
     write_atomically(folder / TABLE_FILE, markdown(rows, paper or {}))
     write_csv(folder / CSV_FILE, _records(rows, paper or {}))
     written = [folder / TABLE_FILE, folder / CSV_FILE]
-    figure = picture(rows)
+    figure = (draw or picture)(rows)
     if figure is not None:
         write_png(folder / PICTURE_FILE, figure_picture(figure))
         written.append(folder / PICTURE_FILE)

@@ -9,6 +9,7 @@ import logging
 import os
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,11 +90,17 @@ class JobLauncher(Launcher):
 
 def planned(context: HydraContext, config: DictConfig, number: int, overrides: Sequence[str]) -> Job:
     """A job of a sweep with its folder, which Hydra names by the job's own configuration."""
-    before = HydraConfig.instance().cfg
-    try:
-        own = _configuration(context, config, number, overrides)
+    with composed(context, config, number, overrides) as own:
         folder = Path(own.hydra.sweep.dir, own.hydra.sweep.subdir)
         return Job(number, tuple(overrides), folder, OmegaConf.select(own, "threads"))
+
+
+@contextmanager
+def composed(context: HydraContext, config: DictConfig, number: int, overrides: Sequence[str]) -> Iterator[DictConfig]:
+    """The configuration of one job of a sweep, which is Hydra's current one while it lasts."""
+    before = HydraConfig.instance().cfg
+    try:
+        yield _configuration(context, config, number, overrides)
     finally:
         HydraConfig.instance().cfg = before
 

@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from heatsplat.errors import SceneError
 from heatsplat.io.command_lines import keys_of
-from hydra_plugins.heatsplat_launchers._jobs import JobLauncher, planned
+from hydra_plugins.heatsplat_launchers._jobs import JobLauncher, composed, planned
 
 if TYPE_CHECKING:
     from heatsplat.studies.sweep_plan import SweepPlan
@@ -87,6 +87,8 @@ class RowSweeper(BasicSweeper):
         paper: the paper's table that the rows are beside: {"of": paper, "table": label, "scenes": whose figures}; None without.
         rows: name of a row -> {"set": overrides of the row, "printed": its setting in that table}; None for a grid alone.
         of: the method whose parts the rows are, or several; another is refused. None for any.
+        knobs: in place of rows, settings whose numbers are changed one at a time: {"of": settings, "factors": by which}; None
+            without.
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class RowSweeper(BasicSweeper):
         paper: Mapping[str, Any] | None = None,
         rows: Mapping[str, Mapping[str, Any]] | None = None,
         of: str | Sequence[str] | None = None,
+        knobs: Mapping[str, Any] | None = None,
     ) -> None:
         if max_batch_size is not None and max_batch_size < 1:
             raise ValueError(f"hydra.sweeper.max_batch_size must be 1 or more, or null for all, got {max_batch_size}")
@@ -105,6 +108,7 @@ class RowSweeper(BasicSweeper):
         self.paper = paper
         self.rows = rows
         self.of = of
+        self.knobs = knobs
         self.plan: SweepPlan | None = None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
@@ -161,10 +165,23 @@ class RowSweeper(BasicSweeper):
 
             asked = OmegaConf.to_container(self.config.leaderboard, resolve=True)
             return Leaderboard(board_of(asked, self._methods(), keys_of(arguments)))
+        if self.knobs is not None:
+            from heatsplat.studies.knobs import Knobs
+
+            return Knobs(self._numbers, self.knobs["factors"])
         from heatsplat.studies.rows import Rows
 
         chosen = OmegaConf.select(self.config, "hydra.runtime.choices.method")
         return Rows(self.rows or {}, self.paper, self.of, chosen)
+
+    def _numbers(self, job: Sequence[str]) -> Mapping[str, Any]:
+        """The numbers of a job that the knobs are. Raises SceneError for none."""
+        from heatsplat.studies.knobs import numbers_of
+
+        with composed(self.hydra_context, self.config, 0, job) as config:
+            own = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+            written, settings = (OmegaConf.to_container(own, resolve=resolve) for resolve in (False, True))
+        return numbers_of(written, settings, self.knobs["of"])
 
     def _table(self, given: set[str]) -> SweepPlan:
         """The plan of a published table."""
