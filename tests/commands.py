@@ -1,11 +1,13 @@
 """The scripts as a user types them, each in a process of its own.
 
-Loading torch, Lightning and their like takes longer than what a test asks of a script. A server loads them once; a command
-then starts as a fork of it, runs the script's file as ``__main__``, and loads heatsplat itself from beside that file.
+Loading torch, Lightning, heatsplat and their like takes longer than what a test asks of a script. A server loads them once; a
+command then starts as a fork of it and runs the script's file as ``__main__``. A script of another folder, such as a copy of the
+repository, loads its own heatsplat.
 """
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import runpy
@@ -13,12 +15,18 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from multiprocessing import forkserver
 from pathlib import Path
+from unittest import mock
 
 ROOT = Path(__file__).resolve().parents[1]
+SOURCES = ROOT / "src"
+OURS = ("heatsplat", "hydra_plugins")
 LIBRARIES = (
     "torch", "pytorch_lightning", "torchmetrics", "torch.utils.tensorboard", "kornia", "numba", "cv2", "skimage.metrics",
     "scipy.stats", "scipy.spatial", "matplotlib.figure", "hydra", "rich.progress", "pvlib",
+    "heatsplat.cli", "heatsplat.runs.run", "heatsplat.datamodules.synthetic",
+    *(f"heatsplat.callbacks.{file.stem}" for file in sorted((SOURCES / "heatsplat/callbacks").glob("[a-z]*.py"))),
 )  # fmt: skip
 
 
@@ -43,6 +51,8 @@ def python(
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(LIBRARIES))
+    with mock.patch.dict(os.environ, PYTHONPATH=str(SOURCES)):  # of this checkout, wherever another is installed
+        forkserver.ensure_running()
     with tempfile.TemporaryDirectory() as folder:
         printed = Path(folder, "printed")
         variables = {**os.environ, **(environment or {})}
@@ -72,4 +82,8 @@ def _run(arguments: list[str], cwd: str, variables: dict[str, str], printed: str
     os.environ.clear()
     os.environ.update(variables)
     sys.argv = arguments
+    gc.freeze()  # what the server loaded is not looked through again
+    if Path(arguments[0]).resolve().parent != SOURCES:
+        for name in [name for name in sys.modules if name.partition(".")[0] in OURS]:
+            del sys.modules[name]
     runpy.run_path(arguments[0], run_name="__main__")

@@ -1,14 +1,20 @@
 """Test processes side by side (pytest -n) share the cores; a synthetic scene is filmed once in each of them."""
 
+import dataclasses
 import functools
+import hashlib
 import logging
 import os
 import pickle
 import signal
+from pathlib import Path
 
+import cloudpickle
 import omegaconf
 import pytest
+from hydra import version
 from hydra._internal import defaults_list
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
 
 from heatsplat.composition import CONF
@@ -102,19 +108,32 @@ def configurations_read_once():
     """Files of conf/ and interpolations are parsed once in each process: the suite composes more than a thousand times, 0.25 s
     each, half of that parsing.
 
-    What is found beside further folders (``hydra.searchpath``) is read anew; tests write those. And Hydra makes a map of all
-    choices for each of some thirty files, a fifth of the time, which it reads only where a default depends on another.
+    What is found beside further folders (``hydra.searchpath``) is read anew; tests write those. The same files are merged once.
+    And Hydra makes a map of all choices for each of some thirty files, a fifth of the time, which it reads only where a default
+    depends on another, and reads the number of its version some eight hundred times, a tenth.
     """
-    read, known = ConfigRepository.load_config, {}
+    read, merge = ConfigRepository.load_config, ConfigLoaderImpl._compose_config_from_defaults_list
+    known, merged = {}, {}  # as bytes: what is returned gets changed
     map_of = defaults_list._create_interpolation_map
     parse = functools.cache(omegaconf.base.parse)
 
+    def are_ours(sources):
+        return [source.path for source in sources if source.scheme() == "file"] == [CONF]
+
     def load_config(self, config_path):
-        if [source.path for source in self.sources if source.scheme() == "file"] != [CONF]:
+        if not are_ours(self.sources):
             return read(self, config_path)
         if config_path not in known:
-            known[config_path] = pickle.dumps(read(self, config_path))  # what is returned gets changed
+            known[config_path] = pickle.dumps(read(self, config_path))
         return pickle.loads(known[config_path])
+
+    def merge_all(self, defaults, repo):
+        if not are_ours(repo.get_sources()):
+            return merge(self, defaults, repo)
+        files = repr([dataclasses.astuple(one) for one in defaults])
+        if files not in merged:
+            merged[files] = pickle.dumps(merge(self, defaults, repo))
+        return pickle.loads(merged[files])
 
     def choices(overrides, defaults, self_added):
         depends = any(not one.is_self() and not one.is_override() and one.is_interpolation() for one in defaults)
@@ -122,19 +141,31 @@ def configurations_read_once():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ConfigRepository, "load_config", load_config)
+        patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", merge_all)
         patch.setattr(defaults_list, "_create_interpolation_map", choices)
+        patch.setattr(version, "_get_version", functools.cache(version._get_version))
         patch.setattr(omegaconf.base, "parse", parse)
         patch.setattr(omegaconf._utils, "parse", parse)
         yield
 
 
+@pytest.fixture(scope="session")
+def films(tmp_path_factory) -> Path:
+    """A folder of scenes that one test process filmed and the others read."""
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if WORKERS else own) / "films"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
 @pytest.fixture(scope="module", autouse=True)
-def filmed_once(request):
+def filmed_once(request, films):
     """Runs on the same recording share it: filming takes half of a tiny run. Tests of filming itself film."""
     if request.path.parent.name in FILMING:
         yield
         return
     from heatsplat.datamodules.synthetic import Synthetic
+    from heatsplat.io.files import write_atomically
 
     film = Synthetic.load
 
@@ -142,7 +173,10 @@ def filmed_once(request):
         own = {key: value for key, value in vars(self).items() if key not in ("trainer", "scene") and key[0] != "_"}
         settings = repr(sorted(own.items()))
         if settings not in FILMED:
-            FILMED[settings] = film(self)
+            file = films / hashlib.sha256(settings.encode()).hexdigest()
+            if not file.exists():
+                write_atomically(file, cloudpickle.dumps(film(self)))
+            FILMED[settings] = pickle.loads(file.read_bytes())
         return FILMED[settings]
 
     with pytest.MonkeyPatch.context() as patch:

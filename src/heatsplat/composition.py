@@ -81,7 +81,9 @@ def compose_unresolved(overrides: Sequence[str] = (), name: str = "train") -> Di
     with _opened():
         config = hydra.compose(name, list(overrides), return_hydra_config=True)
     HydraConfig.instance().set_config(config)
-    return OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    OmegaConf.set_struct(config, None)
+    del config["hydra"]
+    return config
 
 
 @functools.cache
