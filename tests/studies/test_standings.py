@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from boards import ASKED, board, hand_in, protocol_folder, run_of
 
+from heatsplat.studies.leaderboard.plan import board_of
 from heatsplat.studies.leaderboard.standings import (
     Entry,
     Result,
@@ -33,13 +34,29 @@ def entry_of(*values: float) -> Entry:
     return Entry("a", "b", "steps", [Result(seed, score, {}, Path(), "") for seed, score in enumerate(scores)])
 
 
-def test_one_seed_spreads_as_the_others_do():
-    usual = usual_spread([entry_of(1.0, 1.2), entry_of(2.0, 2.4), entry_of(5.0), entry_of()], "mae_c")
-    assert usual == pytest.approx(0.02**0.5 / 1.1)
-    assert standard_error(entry_of(2.0), "mae_c", usual) == pytest.approx(2.0 * usual)
+def test_a_spread_is_weighed_with_the_usual_one_and_one_seed_has_that():
+    usual = usual_spread([entry_of(1.0, 1.2), entry_of(2.0, 2.2, 2.4), entry_of(5.0), entry_of()], "mae_c")
+    assert usual == pytest.approx(((0.02 / 1.21 + 2 * 0.04 / 4.84) / 3) ** 0.5)
+    assert standard_error(entry_of(2.0), "mae_c", 0.1) == pytest.approx(0.2)
+    assert standard_error(entry_of(2.0, 2.0), "mae_c", 0.1) == pytest.approx((2 * 0.04 / 3 / 2) ** 0.5)
+    assert standard_error(entry_of(1.0, 1.2), "mae_c", 0.0) == pytest.approx((0.02 / 3 / 2) ** 0.5)
+    assert standard_error(entry_of(1.0, 1.2), "mae_c", None) == pytest.approx(0.1)
     assert standard_error(entry_of(2.0), "mae_c", None) == 0.0
-    assert standard_error(entry_of(1.0, 1.2), "mae_c", usual) == pytest.approx(0.1)
     assert usual_spread([entry_of(1.0), entry_of(2.0)], "mae_c") is None
+
+
+def test_two_seeds_alike_by_chance_are_no_certainty(tmp_path):
+    """On each scene seeds vary by what they vary by there."""
+    root, sweep = protocol_folder(tmp_path / "root", "cooling", "driven"), tmp_path / "sweep"
+    for scene, apart in (("cooling", 0.4), ("driven", 0.002)):
+        for seed in (0, 1):
+            run_of(sweep, "3dgs", scene, seed, 1.0)
+            run_of(sweep, "etgs", scene, seed, 1.1)
+            run_of(sweep, "ti3dgs", scene, seed, 2.0 + seed * apart)
+    asked = board_of({**ASKED, "root": str(root)}, ["3dgs", "etgs", "ti3dgs"], ())
+    found = {(one.method, one.scene): one.rank for one in standings(sweep, asked).entries}
+    assert [found[method, "cooling"] for method in ("3dgs", "etgs", "ti3dgs")] == [(1, 2), (1, 2), (3, 3)]
+    assert [found[method, "driven"] for method in ("3dgs", "etgs", "ti3dgs")] == [(1, 1), (2, 2), (3, 3)]
 
 
 def test_a_seed_counts_once(tmp_path):
@@ -84,7 +101,8 @@ def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):
     assert found["etgs", "driven"].reason.endswith("lacks weather") and found["etgs", "driven"].rank is None
     assert (
         spread_of(list(found.values()), asked)
-        == "Methods with one seed are assumed to vary by 6.7 %, the average of the others."
+        == "Seeds vary by 6.7 % (standard deviation, pooled over methods). A method's own spread is weighed with that; one seed "
+        "has that."
     )
     assert found["3dgs", "driven"].reason == "not run yet"
     assert found["supirgs", "driven"].reason.startswith("it is for low-resolution images")

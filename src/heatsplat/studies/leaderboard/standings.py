@@ -7,7 +7,7 @@ import logging
 import math
 import re
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
@@ -26,6 +26,9 @@ log = logging.getLogger("heatsplat")
 
 SCORE_FILE, SUBMISSION = "score.json", "submission"
 WIDTH = 2.0  # standard errors of a difference below which two methods are tied
+PRIOR = (
+    2.0  # degrees of freedom that the usual spread of a scene counts for: two seeds alike by chance are no certainty
+)
 
 
 @dataclass(frozen=True)
@@ -168,17 +171,22 @@ def standings(folder: Path, board: Board) -> Standings:
                 places.setdefault(place, Entry(*place))
         note = sentence(add_earlier(places, board.earlier))
     entries = list(places.values())
-    usual = usual_spread(entries, board.score)
-    for scene in dict.fromkeys(entry.scene for entry in entries):
-        for track in board.tracks:
-            ranked = [
-                one for one in entries if (one.scene, one.track) == (scene, track) and one.mean(board.score) is not None
-            ]
-            means = [one.mean(board.score) for one in ranked]
-            errors = [standard_error(one, board.score, usual) for one in ranked]
-            for entry, rank in zip(ranked, ranks(means, errors, board.higher), strict=True):
-                entry.rank = rank
+    for ranked, usual in _competitions(entries, board):
+        means = [one.mean(board.score) for one in ranked]
+        errors = [standard_error(one, board.score, usual) for one in ranked]
+        for entry, rank in zip(ranked, ranks(means, errors, board.higher), strict=True):
+            entry.rank = rank
     return Standings(entries, note)
+
+
+def _competitions(entries: Sequence[Entry], board: Board) -> Iterator[tuple[list[Entry], float | None]]:
+    """The entries with results of each scene and track, and by what their seeds usually vary: as on all scenes where no entry
+    of this one has several."""
+    everywhere = usual_spread(entries, board.score)
+    for place in dict.fromkeys((entry.scene, entry.track) for entry in entries):
+        own = [one for one in entries if (one.scene, one.track) == place and one.mean(board.score) is not None]
+        usual = usual_spread(own, board.score)
+        yield own, everywhere if usual is None else usual
 
 
 def _entries(board: Board) -> list[Entry]:
@@ -239,28 +247,38 @@ def scored_once(folder: Path, scene: str, board: Board) -> SceneScore:
 
 
 def usual_spread(entries: Sequence[Entry], score: str) -> float | None:
-    """Standard deviation over seeds as a share of the mean: root mean square over all that have several; None for none."""
-    known = [(one.deviation(score), one.mean(score)) for one in entries]
-    shares = [deviation / mean for deviation, mean in known if deviation is not None and mean > 0]
-    return math.sqrt(statistics.fmean(share**2 for share in shares)) if shares else None
+    """Standard deviation over seeds as a share of the mean, pooled over all that have several; None for none."""
+    known = [(one.deviation(score), one.mean(score), one.seeds - 1) for one in entries]
+    shares = [(deviation / mean, free) for deviation, mean, free in known if deviation is not None and mean > 0]
+    freedom = sum(free for _, free in shares)
+    return math.sqrt(sum(free * share**2 for share, free in shares) / freedom) if shares else None
 
 
 def spread_of(entries: Sequence[Entry], board: Board) -> str:
-    """A sentence on what is taken for the spread of what ran with one seed."""
-    if not any(one.seeds == 1 for one in entries):
-        return ""
-    usual = usual_spread(entries, board.score)
-    if usual is None:
+    """A sentence on how far seeds vary, and what of it decides ties."""
+    found = [usual for own, usual in _competitions(entries, board) if own and usual is not None]
+    if not found:
         return "All methods ran with one seed, so the spread is unknown and ranks follow the means."
-    return f"Methods with one seed are assumed to vary by {100 * usual:.1f} %, the average of the others."
+    low, high = (f"{100 * share:.1f}" for share in (min(found), max(found)))
+    varied = f"{low} %" if low == high else f"{low} to {high} %, depending on the scene"
+    return (
+        f"Seeds vary by {varied} (standard deviation, pooled over methods). A method's own spread is weighed with that; "
+        "one seed has that."
+    )
 
 
 def standard_error(entry: Entry, score: str, usual: float | None) -> float:
-    """Of the mean over seeds; what ran with one seed is taken to spread by ``usual`` of its mean, all by 0 without it."""
-    deviation = entry.deviation(score)
-    if deviation is None:
-        deviation = (usual or 0.0) * abs(entry.mean(score))
-    return deviation / math.sqrt(entry.seeds)
+    """Of the mean over seeds, from their variance and the usual one by the degrees of freedom of each (``PRIOR``).
+
+    Args:
+        entry: with results.
+        score: of which.
+        usual: spread of its scene as a share of the mean; None where nothing is known, and then one seed has none.
+    """
+    own, free = entry.deviation(score) or 0.0, entry.seeds - 1
+    prior = 0.0 if usual is None else PRIOR
+    squares = free * own**2 + prior * ((usual or 0.0) * entry.mean(score)) ** 2
+    return math.sqrt(squares / max(free + prior, 1) / entry.seeds)
 
 
 def ranks(means: Sequence[float], errors: Sequence[float], higher: bool = False) -> list[tuple[int, int]]:
