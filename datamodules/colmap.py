@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,16 +13,14 @@ import numpy as np
 from heatsplat.contracts import SceneData, SceneError, ThermalRange, check_option
 from heatsplat.datamodules.base import CELSIUS, Counts, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
-from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius
+from heatsplat.datamodules.frame_times import FRAMES_FILE, FrameTimes
 from heatsplat.datamodules.points import random_points, told_random
 from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames
-from heatsplat.datamodules.side_files import finite, json_object, read_table
-from heatsplat.datamodules.timestamps import dji_time, time_by_pattern, times_from_csv
+from heatsplat.datamodules.side_files import finite, json_object
 
-FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
 # Of a prepared folder: metres_per_unit of the sparse model, and its axes, where GPS has told them.
 WORLD_FILE = "world.json"
 META_FILE = "meta.csv"  # of a published flight: file, latitude and more of each frame
@@ -71,10 +69,7 @@ class Colmap(SceneDataModule):
         raw_scale, raw_offset_c: °C = raw_scale * counts + raw_offset_c.
         radiometric: "auto" reads temperatures out of radiometric JPEGs, "never" takes their pictures as greys.
         bounds_c: [min, max] in °C that 0 and 1 stand for; None takes temperature_bounds.json or the data's own range.
-        time_regex: picks the time out of an image name (first group), or None.
-        time_format: strptime format of it, HHMMSSmmm, or None for a number of seconds.
-        time_csv: table of times, relative to the scene or the working directory, or None.
-        time_csv_name, time_csv_time: its columns of image names and of times (seconds or ISO date-times).
+        time_regex, time_format, time_csv, time_csv_name, time_csv_time: where times come from (``FrameTimes``).
         ambient_c: temperature of the surroundings in °C, or None.
         metres_per_unit: scale of the sparse model; None takes the world.json of a prepared folder, where there is one.
         random_points: number of points to make up where the sparse model has none.
@@ -113,10 +108,7 @@ class Colmap(SceneDataModule):
         self.counts = Counts(raw_scale, raw_offset_c)
         self.radiometric = radiometric
         self.bounds_c = bounds_c
-        self.time_regex = time_regex
-        self.time_format = time_format
-        self.time_csv = time_csv
-        self.time_csv_columns = (time_csv_name, time_csv_time)
+        self.times = FrameTimes(time_regex, time_format, time_csv, time_csv_name, time_csv_time)
         self.ambient_c = ambient_c
         self.metres_per_unit = metres_per_unit
         self.random_points = random_points
@@ -132,7 +124,7 @@ class Colmap(SceneDataModule):
         kept, notes = match_model(model, files, index, self.raw or self.images or self.rgb)
         read, counts, encoding = self._reader(raw, index, [files[i] for i in kept])
         notes["encoding"] = encoding
-        times, notes["time_source"] = self._times(folder, kept)
+        times, notes["time_source"] = self.times.of(folder, kept)
         bounds, bounds_source = self._bounds(folder)
         metres_per_unit, axes = _world(folder)
         if axes:
@@ -196,31 +188,6 @@ class Colmap(SceneDataModule):
         file = folder / BOUNDS_FILE
         return (read_bounds(file)[0], file.name) if file.is_file() else (None, "")
 
-    def _times(self, folder: Path, names: Sequence[str]) -> tuple[dict[str, float] | None, str]:
-        """Seconds by image name, or None, and where they come from."""
-        if self.time_csv:
-            path = folder / Path(self.time_csv).expanduser()
-            path = path if path.is_file() else Path(self.time_csv).expanduser().absolute()
-            times = _looked_up(times_from_csv(path, *self.time_csv_columns), names, path)
-            if missing := [name for name in names if name not in times]:
-                raise SceneError(
-                    f"data.time_csv: {path} has no row for {missing[0]} ({len(missing)} of {len(names)} images); "
-                    f"column {self.time_csv_columns[0]} must hold the image names"
-                )
-            return times, f"{path.name}, column {self.time_csv_columns[1]}"
-        if self.time_regex:
-            times = {name: time_by_pattern(name, self.time_regex, self.time_format) for name in names}
-            return times, f"file names, {self.time_regex} as {self.time_format or 'seconds'}"
-        path = folder / FRAMES_FILE  # without times where a frame had none
-        if path.is_file() and "time_s" in read_table(path).columns:
-            times = _looked_up(times_from_csv(path, "file", "time_s"), names, path)
-            if len(times) == len(names):
-                return times, path.name
-        times = {name: dji_time(name) for name in names}
-        if all(t is not None for t in times.values()):
-            return times, "DJI file names (whole seconds, the camera's clock)"  # type: ignore[return-value]
-        return None, "none (set data.time_regex or data.time_csv)"
-
 
 def _read_counts(path: Path) -> np.ndarray:
     """Raw sensor counts [H, W] uint16. Raises SceneError for 8-bit or colour images, which hold no counts."""
@@ -232,20 +199,3 @@ def _read_counts(path: Path) -> np.ndarray:
             "leave data.raw out to use the images as greys"
         )
     return pixels
-
-
-def _looked_up(times: Mapping[str, float], names: Sequence[str], path: Path) -> dict[str, float]:
-    """Seconds of those images that the table in ``path`` names, with folders or without.
-
-    Raises:
-        SceneError: it has different times for an image.
-    """
-    found = {}
-    for name, rows in same_files(names, times).items():
-        if len({times[row] for row in rows}) > 1:
-            raise SceneError(
-                f"{path}: {' and '.join(rows)} have different times and may both be {name}; keep one of them"
-            )
-        if rows:
-            found[name] = times[rows[0]]
-    return found

@@ -24,7 +24,15 @@ from heatsplat.datamodules.formats.images import (
     read_image,
     split_alpha,
 )
-from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in, read_transforms, viewmat_of
+from heatsplat.datamodules.formats.nerfstudio import (
+    TIME_KEYS,
+    Transforms,
+    lens_in,
+    read_transforms,
+    time_in,
+    viewmat_of,
+)
+from heatsplat.datamodules.frame_times import FrameTimes
 from heatsplat.datamodules.points import ply_points, random_points, told_random
 from heatsplat.datamodules.side_files import shortened
 from heatsplat.datamodules.splits import TEST_WORDS, TRAIN_WORDS, SplitRule
@@ -58,18 +66,33 @@ class Nerfstudio(SceneDataModule):
     Poses are camera-to-world in OpenGL axes. A frame names its thermal image (thermal_file_path, thermal, ir) and its
     visible one (file_path, rgb, image), or one image of file_path. That is thermal where it lies in thermal/, or is grey,
     or the scene has temperature bounds; coloured ones are photos, and the scene an RGB scene. Points come from a COLMAP
-    model in the scene, from the JSON's ply_file_path, or are random ones. What was assumed stands in the notes.
+    model in the scene, from the JSON's ply_file_path, or are random ones. Times are those of the frames (time_s, or time, in
+    seconds), unless a table or a pattern is given. What was assumed stands in the notes.
 
     Args:
         rgb: True to load the visible images as well.
+        time_regex, time_format, time_csv, time_csv_name, time_csv_time: where times come from (``FrameTimes``).
         random_points: number of points to make up where the scene has none.
         shared: options of every loader (``SceneDataModule``). The split "names" takes what the JSON lists, without
             frames in none of its lists, and every 8th frame where neither it nor any name speaks of train or test.
     """
 
-    def __init__(self, *, split: str = "names", rgb: bool = True, random_points: int = 20_000, **shared: Any) -> None:
+    def __init__(
+        self,
+        *,
+        split: str = "names",
+        rgb: bool = True,
+        time_regex: str | None = None,
+        time_format: str | None = None,
+        time_csv: str | None = None,
+        time_csv_name: str = "file",
+        time_csv_time: str = "time_s",
+        random_points: int = 20_000,
+        **shared: Any,
+    ) -> None:
         super().__init__(split=split, **shared)
         self.rgb = rgb
+        self.times = FrameTimes(time_regex, time_format, time_csv, time_csv_name, time_csv_time)
         self.random_points = random_points
 
     def load(self) -> SceneData:
@@ -90,7 +113,7 @@ class Nerfstudio(SceneDataModule):
                 log.warning("scene %s: %s of %s", folder.name, found["images_unlisted"], first.path.name)
             frames = [f for f in frames if f.subset]
         points, colors, origin = self._points(folder, first, frames)
-        notes |= found | origin | {"time_source": "none: the data set has no times"}
+        notes |= found | origin
         split, says = self._split(frames, first)
         notes |= says
         if assumed := [notes[key] for key in ("keys_assumed", "images_assumed", "split_assumed") if key in notes]:
@@ -143,7 +166,7 @@ class Nerfstudio(SceneDataModule):
         mains = [entry.visible if photos else entry.thermal for entry in entries]
         plain_names = [PurePosixPath(main).name for main in mains if main is not None]
         with_folders = len(listed) > 1 or len(set(plain_names)) < len(plain_names)
-        frames, missing = [], []
+        frames, missing, written = [], [], {}
         for entry, main, in_list in zip(entries, mains, subsets, strict=True):
             if main is None:
                 missing.append(str(entry.frame["file_path"]))
@@ -162,6 +185,7 @@ class Nerfstudio(SceneDataModule):
                     subset=entry.subset or in_list,
                 )
             )
+            written[name] = time_in(entry.transforms, entry.frame)
         if not frames:
             raise SceneError(
                 f"none of the {len(entries)} frames of {next(iter(listed)).path} has a thermal image in {folder}: "
@@ -171,7 +195,26 @@ class Nerfstudio(SceneDataModule):
             notes["images_missing"] = f"{len(missing)} frames have no thermal image, dropped: {', '.join(missing[:5])}"
         if self.rgb:
             notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
-        return frames, notes
+        times, notes["time_source"] = self._times(folder, written, [*listed][0])
+        return [replace(f, time_s=times[f.name]) for f in frames] if times else frames, notes
+
+    def _times(
+        self, folder: Path, written: Mapping[str, float | None], transforms: Transforms
+    ) -> tuple[Mapping[str, float] | None, str]:
+        """Seconds by name, or None, and a note. Raises SceneError where some frames have a time and others have not."""
+        known = {name: time for name, time in written.items() if time is not None}
+        if known and len(known) < len(written) and not self.times.are_told:
+            lacking = next(name for name in written if name not in known)
+            raise SceneError(
+                f"{transforms.path}: {lacking} has no {' or '.join(TIME_KEYS)}, which {len(known)} of {len(written)} frames "
+                "have: give all frames one, or none, or data.time_csv"
+            )
+        where = f"{transforms.path.name}, in seconds"
+        if known and min(known.values()) >= 0.0 and max(known.values()) == 1.0:
+            where += (
+                " (all lie from 0 to 1: if they are shares of the recording, rates and time constants are in those)"
+            )
+        return self.times.of(folder, list(written), known or None, where)
 
     def _points(
         self, folder: Path, transforms: Transforms, frames: Sequence[RawFrame]

@@ -108,7 +108,7 @@ def times_from_csv(path: Path, name_column: str, time_column: str) -> dict[str, 
     for number, row in table.rows:
         cell = row[time_at]
         try:
-            seconds = _seconds_of(table.pointed(cell))
+            seconds = seconds_of(table.pointed(cell))
         except ValueError as error:
             raise SceneError(
                 f"{path}, line {number}: {cell!r} in column {time_column} is neither seconds nor a date-time "
@@ -121,7 +121,7 @@ def times_from_csv(path: Path, name_column: str, time_column: str) -> dict[str, 
     return times
 
 
-def _seconds_of(text: str) -> float:
+def seconds_of(text: str) -> float:
     """Seconds, or those of an ISO date-time since 1970. Raises ValueError for anything else."""
     try:
         return float(text)

@@ -14,6 +14,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 from heatsplat.datamodules.poses import checked_pose
 from heatsplat.datamodules.side_files import finite, json_object, shortened
+from heatsplat.datamodules.timestamps import seconds_of
 from heatsplat.geometry.transforms import OPENGL_AXES
 
 # nerfstudio has one OPENCV model for all polynomial lenses; FULL_OPENCV reads whatever of its coefficients are there.
@@ -21,6 +22,8 @@ _COLMAP_NAME = {"OPENCV": "FULL_OPENCV", "PERSPECTIVE": "PINHOLE"}
 # Keys of a frame's images, in order of preference: the first of each is the data sets' own.
 THERMAL_KEYS = ("thermal_file_path", "thermal", "thermal_path", "ir", "infrared")
 VISIBLE_KEYS = ("file_path", "rgb", "rgb_file_path", "rgb_path", "image", "image_path", "color")
+
+TIME_KEYS = ("time_s", "time")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +94,22 @@ def viewmat_of(transforms: Transforms, frame: dict[str, Any], opengl: bool) -> n
     if opengl:
         c2w = c2w @ OPENGL_AXES
     return np.linalg.inv(c2w)
+
+
+def time_in(transforms: Transforms, frame: dict[str, Any]) -> float | None:
+    """Seconds of a frame, None where it has no time: a number, or an ISO 8601 date-time. Raises SceneError for anything else."""
+    key = next((key for key in TIME_KEYS if frame.get(key) is not None), None)
+    if key is None:
+        return None
+    source = f"{transforms.path}: {key} of {frame['file_path']}"
+    if not isinstance(frame[key], str):
+        return finite(frame[key], source)
+    try:
+        return finite(seconds_of(frame[key]), source)
+    except ValueError as error:
+        raise SceneError(
+            f"{source} is {frame[key]!r}, neither seconds nor a date-time such as 2024-08-06T15:35:05.376"
+        ) from error
 
 
 def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tuple[int, int]]) -> Lens:

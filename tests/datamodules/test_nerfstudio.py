@@ -218,3 +218,66 @@ def test_a_model_of_two_cameras_is_matched_by_folders(tmp_path):
     write_frames(tmp_path, [{"file_path": file} for file in files])
     write_colmap(tmp_path, [file.removeprefix("thermal/") for file in files], images=None)
     assert "(COLMAP)" in loaded(tmp_path, split="every_8th").notes["points_source"]
+
+
+def timed(root, times, **options):
+    """A scene whose frames have these times under these keys: [(key, value) or None], and what was noted."""
+    for i, name in enumerate(names(len(times))):
+        write_image(root / "thermal" / name, grey(i))
+    frames = [
+        {"file_path": f"thermal/{n}"} | dict([t] if t else []) for n, t in zip(names(len(times)), times, strict=True)
+    ]
+    write_frames(root, frames)
+    return loaded(root, **options)
+
+
+def times_of(scene):
+    """Seconds after the first image, by name."""
+    times = {frame.name: frame.time_s for views in (scene.train, scene.test) for frame in views.frames}
+    return times if None in times.values() else {name: time - min(times.values()) for name, time in times.items()}
+
+
+@pytest.mark.parametrize(
+    ("times", "seconds"),
+    [
+        ([("time", 20.0), ("time", 30), ("time", 50.5)], [0.0, 10.0, 30.5]),
+        ([("time_s", 5.0), ("time_s", 6.0), ("time_s", 9.0)], [0.0, 1.0, 4.0]),
+        ([("time", f"2024-08-06T12:00:{s:02d}Z") for s in (0, 10, 40)], [0.0, 10.0, 40.0]),
+    ],
+)
+def test_frames_have_the_times_that_the_file_gives_them(tmp_path, times, seconds):
+    scene = timed(tmp_path, times)
+    assert times_of(scene) == dict(zip(names(3), seconds, strict=True))
+    assert scene.notes["time_source"].startswith("transforms.json, in seconds")
+    assert "shares of the recording" not in scene.notes["time_source"]
+
+
+def test_times_that_may_be_shares_are_told_and_a_table_comes_first(tmp_path):
+    shares = [("time", k / 3) for k in range(4)]
+    assert "if they are shares of the recording" in timed(tmp_path, shares).notes["time_source"]
+    (tmp_path / "clock.csv").write_text("file,time_s\n" + "".join(f"{n},{60 * k}\n" for k, n in enumerate(names(4))))
+    scene = loaded(tmp_path, time_csv="clock.csv")
+    assert sorted(times_of(scene).values()) == [0.0, 60.0, 120.0, 180.0]
+    assert scene.notes["time_source"] == "clock.csv, column time_s"
+
+
+def test_without_times_there_are_none(tmp_path):
+    scene = timed(tmp_path, [None, None, None])
+    assert set(times_of(scene).values()) == {None} and scene.notes["time_source"].startswith("none")
+
+
+@pytest.mark.parametrize(
+    ("times", "told"),
+    [
+        ([("time", 0.0), None, ("time", 2.0)], r"transforms.json: frame_001.png has no time_s or time, which 2 of 3"),
+        (
+            [("time", 0.0), ("time", "noon"), ("time", 2.0)],
+            r"time of thermal/frame_001.png is 'noon', neither seconds nor",
+        ),
+        ([("time", 0.0), ("time", [1]), ("time", 2.0)], r"time of thermal/frame_001.png"),
+        ([("time", 0.0), ("time", float("nan")), ("time", 2.0)], r"time of thermal/frame_001.png"),
+    ],
+)
+def test_times_that_are_none_are_refused(tmp_path, times, told):
+    with pytest.raises(SceneError, match=told):
+        timed(tmp_path, times)

@@ -1,0 +1,52 @@
+"""Where the times of images come from, and which of several places counts."""
+
+import pytest
+
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.frame_times import FrameTimes
+
+NAMES = ("a_010.png", "a_020.png")
+DJI = ("DJI_20240806173449_0008_T.JPG", "DJI_20240806173500_0009_T.JPG")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "frames.csv").write_text("file,time_s\na_010.png,1\na_020.png,2\n")
+    (tmp_path / "clock.csv").write_text("name;when\nA_010;2024-08-06T12:00:00Z\nA_020;2024-08-06T12:01:00Z\n".lower())
+    return tmp_path
+
+
+def test_a_table_counts_before_a_pattern_before_the_poses_file_before_what_lies_beside_it(folder):
+    pattern = {"time_regex": r"_(\d+)"}
+    table = {"time_csv": "clock.csv", "time_csv_name": "name", "time_csv_time": "when"}
+    written = {"a_010.png": 100.0, "a_020.png": 200.0}
+    asked = [
+        (FrameTimes(**table, **pattern), written),
+        (FrameTimes(**pattern), written),
+        (FrameTimes(), written),
+        (FrameTimes(), None),
+    ]
+    found = [times.of(folder, NAMES, own, "poses.json") for times, own in asked]
+    assert [times["a_020.png"] - times["a_010.png"] for times, _ in found] == [60.0, 10.0, 100.0, 1.0]
+    assert [note.split(",")[0] for _, note in found] == ["clock.csv", "file names", "poses.json", "frames.csv"]
+    assert [times.are_told for times, _ in asked] == [True, True, False, False]
+
+
+def test_without_anything_dji_names_tell_and_other_names_do_not(tmp_path):
+    times, note = FrameTimes().of(tmp_path, DJI)
+    assert times[DJI[1]] - times[DJI[0]] == 11.0 and note.startswith("DJI file names")
+    assert FrameTimes().of(tmp_path, (*DJI, "other.png")) == (None, "none (set data.time_regex or data.time_csv)")
+
+
+def test_frames_csv_without_all_images_has_no_times(folder):
+    assert FrameTimes().of(folder, (*NAMES, "a_030.png"))[0] is None
+
+
+def test_a_table_that_lacks_an_image_is_refused(folder):
+    told = FrameTimes(time_csv="clock.csv", time_csv_name="name", time_csv_time="when")
+    with pytest.raises(
+        SceneError, match=r"clock.csv has no row for a_030.png \(1 of 3 images\); column name must hold"
+    ):
+        told.of(folder, (*NAMES, "a_030.png"))
+    with pytest.raises(SceneError, match="there is no file"):
+        FrameTimes(time_csv="other.csv").of(folder, NAMES)
