@@ -12,7 +12,7 @@ DJI = ("DJI_20240806173449_0008_T.JPG", "DJI_20240806173500_0009_T.JPG")
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "frames.csv").write_text("file,time_s\na_010.png,1\na_020.png,2\n")
-    (tmp_path / "clock.csv").write_text("name;when\nA_010;2024-08-06T12:00:00Z\nA_020;2024-08-06T12:01:00Z\n".lower())
+    (tmp_path / "clock.csv").write_text("name;when\na_010;2024-08-06T12:00:00Z\na_020;2024-08-06T12:01:00Z\n")
     return tmp_path
 
 
