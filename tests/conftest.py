@@ -1,5 +1,7 @@
 """Test processes side by side (pytest -n) share the cores; a synthetic scene is filmed once in each of them."""
 
+import collections
+import copy
 import functools
 import logging
 import os
@@ -10,6 +12,7 @@ import omegaconf
 import pytest
 from hydra._internal import defaults_list
 from hydra._internal.config_repository import ConfigRepository
+from running import filming_once
 
 from heatsplat.composition import CONF
 from heatsplat.training.machine import cores, prepare_machine
@@ -103,7 +106,8 @@ def configurations_read_once():
     each, half of that parsing.
 
     What is found beside further folders (``hydra.searchpath``) is read anew; tests write those. And Hydra makes a map of all
-    choices for each of some thirty files, a fifth of the time, which it reads only where a default depends on another.
+    choices for each of some thirty files, a fifth of the time, which it reads only where a default depends on another. And
+    what OmegaConf knows of each node is copied thousands of times, by what Python does for objects of any kind.
     """
     read, known = ConfigRepository.load_config, {}
     map_of = defaults_list._create_interpolation_map
@@ -120,7 +124,14 @@ def configurations_read_once():
         depends = any(not one.is_self() and not one.is_override() and one.is_interpolation() for one in defaults)
         return map_of(overrides, defaults, self_added) if depends else None
 
+    def copied(self, memo):
+        new = object.__new__(type(self))
+        known = copy.deepcopy(self.resolver_cache, memo) if self.resolver_cache else collections.defaultdict(dict)
+        new.__dict__.update(self.__dict__, flags=copy.copy(self.flags), resolver_cache=known)
+        return new
+
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(omegaconf.base.Metadata, "__deepcopy__", copied, raising=False)
         patch.setattr(ConfigRepository, "load_config", load_config)
         patch.setattr(defaults_list, "_create_interpolation_map", choices)
         patch.setattr(omegaconf.base, "parse", parse)
@@ -136,15 +147,6 @@ def filmed_once(request):
         return
     from heatsplat.datamodules.synthetic import Synthetic
 
-    film = Synthetic.load
-
-    def load(self):
-        own = {key: value for key, value in vars(self).items() if key not in ("trainer", "scene") and key[0] != "_"}
-        settings = repr(sorted(own.items()))
-        if settings not in FILMED:
-            FILMED[settings] = film(self)
-        return FILMED[settings]
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Synthetic, "load", load)
+        patch.setattr(Synthetic, "load", filming_once(Synthetic.load, FILMED))
         yield

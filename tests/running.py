@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
@@ -17,6 +19,19 @@ TINY = (
 def compose_run(*overrides: str, config_name: str = "train") -> DictConfig:
     """The configuration of ``python src/train.py OVERRIDES``, its interpolations not resolved."""
     return compose_unresolved(overrides, config_name)
+
+
+def filming_once(film: Callable, filmed: dict[str, Any]) -> Callable:
+    """``Synthetic.load``, which is ``film``, for recordings that nobody changes: each is filmed once."""
+
+    def load(self):
+        own = {key: value for key, value in vars(self).items() if key not in ("trainer", "scene") and key[0] != "_"}
+        settings = repr(sorted(own.items()))
+        if settings not in filmed:
+            filmed[settings] = film(self)
+        return filmed[settings]
+
+    return load
 
 
 def run(output_dir: Path, *overrides: str):
