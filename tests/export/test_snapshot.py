@@ -12,6 +12,7 @@ from heatsplat.export.snapshot import snapshot
 from heatsplat.shots import at_time
 
 TOLERANCE = 0.05
+FEW = "data.frames=8"  # of scenes that take long to film
 
 
 def started_alone(folder, *overrides):
@@ -82,8 +83,8 @@ def test_what_depends_on_the_view_is_said(tmp_path):
 
 
 def test_parts_of_the_heat_can_be_left_out(tmp_path):
-    few = ("data.scene=haze", "data.frames=4")  # each of which sees the scene through air of its own
-    module = started_alone(tmp_path, "method=auto", "effects=none", "effects.attenuation=on", *few)
+    haze = ("data.scene=haze", "data.frames=4")  # each of which sees the scene through air of its own
+    module = started_alone(tmp_path, "method=auto", "effects=none", "effects.attenuation=on", *haze)
     seen = snapshot(module)
     (without,) = (layer for layer in seen.layers if layer.name == "without attenuation")
     frame = module.scene.train.frames[0]
@@ -97,7 +98,7 @@ def test_parts_of_the_heat_can_be_left_out(tmp_path):
 
 
 def test_visible_light_comes_with_its_own_opacity(tmp_path):
-    module = started_alone(tmp_path, "method=ravigs")
+    module = started_alone(tmp_path, "method=ravigs", FEW)
     with torch.no_grad():
         module.splats.raw["opacity_logits"][:, 1] -= 1.0
     seen = snapshot(module)
@@ -111,7 +112,7 @@ def test_of_many_gaussians_under_weather_few_are_examined(tmp_path, monkeypatch,
     """Against the model itself, of all Gaussians at moments of no special kind."""
     monkeypatch.setattr("heatsplat.export.basis.EXAMINED", 100)
     module = started_alone(
-        tmp_path, f"method={method}", "data.scene=outdoor", *(["effects=none"] if method == "auto" else [])
+        tmp_path, f"method={method}", "data.scene=outdoor", FEW, *(["effects=none"] if method == "auto" else [])
     )
     with torch.no_grad():
         draw = torch.Generator().manual_seed(0)
@@ -156,7 +157,7 @@ METHODS = (
 @pytest.mark.parametrize("method", METHODS)
 def test_some_gaussians_are_what_they_are_among_all(tmp_path, method):
     scene = "outdoor" if method == "ntr_gaussian" else "glass" if method == "ravigs" else "cooling"
-    module = started(tmp_path, f"method={method}", f"data.scene={scene}")
+    module = started(tmp_path, f"method={method}", f"data.scene={scene}", *([] if scene == "cooling" else [FEW]))
     frame, ids = module.scene.train.frames[3], torch.tensor([2, 5, 40])
     with torch.no_grad():
         sent = [module.emissions(module.splats, frame, some) for some in (None, ids)]
