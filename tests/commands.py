@@ -13,10 +13,12 @@ import os
 import runpy
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing import forkserver
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,21 +51,23 @@ def python(
         environment: variables beside those of this process. OpenMP reads its own when the server starts.
         timeout: seconds after which it is killed.
     """
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(LIBRARIES))
-    with mock.patch.dict(os.environ, PYTHONPATH=str(SOURCES)):  # of this checkout, wherever another is installed
-        forkserver.ensure_running()
     with tempfile.TemporaryDirectory() as folder:
         printed = Path(folder, "printed")
         variables = {**os.environ, **(environment or {})}
-        process = context.Process(target=_run, args=([*map(str, arguments)], str(cwd), variables, str(printed)))
-        process.start()
-        process.join(timeout)
-        if process.is_alive():
-            process.kill()
-            process.join()
-            return Done(None, printed.read_text(errors="replace"))
-        return Done(process.exitcode, printed.read_text(errors="replace"))
+        code = _forked(timeout, _run, [*map(str, arguments)], str(cwd), variables, str(printed))
+        return Done(code, printed.read_text(errors="replace"))
+
+
+def in_turn(commands: Sequence[Sequence[str]], cwd: Path = ROOT, timeout: float = 600) -> list[Done]:
+    """Scripts of one folder, one after the other in one process: heatsplat is loaded once, and a scene filmed once.
+
+    Of commands that are not reached, ``returncode`` is None.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        _forked(
+            timeout, _run_in_turn, [[*map(str, arguments)] for arguments in commands], str(cwd), {**os.environ}, folder
+        )
+        return [_ended(Path(folder, f"{number}")) for number in range(len(commands))]
 
 
 def succeeds(arguments: Sequence[str], cwd: Path = ROOT, code: int = 0, **environment: str) -> str:
@@ -73,17 +77,76 @@ def succeeds(arguments: Sequence[str], cwd: Path = ROOT, code: int = 0, **enviro
     return done.output
 
 
+def _forked(timeout: float, target: Callable, *arguments: Any) -> int | None:
+    """The exit code of a fork that runs ``target``; None where it is killed after ``timeout`` seconds."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(LIBRARIES))
+    with mock.patch.dict(os.environ, PYTHONPATH=str(SOURCES)):  # of this checkout, wherever another is installed
+        forkserver.ensure_running()
+    process = context.Process(target=target, args=arguments)
+    process.start()
+    process.join(timeout)
+    if process.is_alive():
+        process.kill()
+        process.join()
+        return None
+    return process.exitcode
+
+
+def _ended(printed: Path) -> Done:
+    code = printed.with_suffix(".code")
+    shown = printed.read_text(errors="replace") if printed.exists() else ""
+    return Done(int(code.read_text()) if code.exists() else None, shown)
+
+
 def _run(arguments: list[str], cwd: str, variables: dict[str, str], printed: str) -> None:
-    """The command, in the fork: streams, folder, variables and arguments are set as a shell does."""
-    stream = os.open(printed, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    for number in (1, 2):
-        os.dup2(stream, number)
+    """The command, in the fork."""
+    _print_to(printed)
+    _as_a_shell_does(arguments[0], cwd, variables)
+    sys.argv = arguments
+    runpy.run_path(arguments[0], run_name="__main__")
+
+
+def _run_in_turn(commands: list[list[str]], cwd: str, variables: dict[str, str], folder: str) -> None:
+    """The commands, in the fork; each leaves a file of what it printed and one of its exit code."""
+    _as_a_shell_does(commands[0][0], cwd, variables)
+    sys.path.insert(0, str(Path(commands[0][0]).resolve().parent))
+    from running import filming_once
+
+    from heatsplat.datamodules.synthetic import Synthetic
+
+    Synthetic.load = filming_once(Synthetic.load, Path(folder))
+    for number, arguments in enumerate(commands):
+        _print_to(f"{folder}/{number}")
+        sys.argv, code = arguments, 0
+        try:
+            runpy.run_path(arguments[0], run_name="__main__")
+        except SystemExit as ended:
+            code = ended.code or 0
+        except Exception:
+            code = traceback.format_exc()
+        if isinstance(code, str):
+            print(code, file=sys.stderr)
+            code = 1
+        sys.stdout.flush()
+        Path(folder, f"{number}.code").write_text(str(code))
+
+
+def _as_a_shell_does(script: str, cwd: str, variables: dict[str, str]) -> None:
+    """Folder and variables of the fork are set, and a script of another folder finds its own heatsplat."""
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(variables)
-    sys.argv = arguments
     gc.freeze()  # what the server loaded is not looked through again
-    if Path(arguments[0]).resolve().parent != SOURCES:
+    if Path(script).resolve().parent != SOURCES:
         for name in [name for name in sys.modules if name.partition(".")[0] in OURS]:
             del sys.modules[name]
-    runpy.run_path(arguments[0], run_name="__main__")
+
+
+def _print_to(path: str) -> None:
+    """Both streams of this process go into a file from here on."""
+    sys.stdout.flush()
+    stream = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    for number in (1, 2):
+        os.dup2(stream, number)
+    os.close(stream)

@@ -1,23 +1,14 @@
 """Test processes side by side (pytest -n) share the cores; a synthetic scene is filmed once in each of them."""
 
-import dataclasses
-import functools
-import hashlib
 import logging
 import os
-import pickle
 import signal
 from pathlib import Path
 
-import cloudpickle
-import omegaconf
 import pytest
-from hydra import version
-from hydra._internal import defaults_list
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.config_repository import ConfigRepository
+from quick_compositions import quick_compositions
+from running import filming_once
 
-from heatsplat.composition import CONF
 from heatsplat.training.machine import cores, prepare_machine
 
 WORKERS = os.environ.get("PYTEST_XDIST_WORKER_COUNT")
@@ -68,7 +59,6 @@ LONGEST = (
     "datamodules/test_glass.py",
     "datamodules/test_outdoor_true.py",
 )
-FILMED = {}  # settings of a recording -> the scene, which nobody changes
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -105,47 +95,7 @@ def threads_as_told():
 
 @pytest.fixture(scope="session", autouse=True)
 def configurations_read_once():
-    """Files of conf/ and interpolations are parsed once in each process: the suite composes more than a thousand times, 0.25 s
-    each, half of that parsing.
-
-    What is found beside further folders (``hydra.searchpath``) is read anew; tests write those. The same files are merged once.
-    And Hydra makes a map of all choices for each of some thirty files, a fifth of the time, which it reads only where a default
-    depends on another, and reads the number of its version some eight hundred times, a tenth.
-    """
-    read, merge = ConfigRepository.load_config, ConfigLoaderImpl._compose_config_from_defaults_list
-    known, merged = {}, {}  # as bytes: what is returned gets changed
-    map_of = defaults_list._create_interpolation_map
-    parse = functools.cache(omegaconf.base.parse)
-
-    def are_ours(sources):
-        return [source.path for source in sources if source.scheme() == "file"] == [CONF]
-
-    def load_config(self, config_path):
-        if not are_ours(self.sources):
-            return read(self, config_path)
-        if config_path not in known:
-            known[config_path] = pickle.dumps(read(self, config_path))
-        return pickle.loads(known[config_path])
-
-    def merge_all(self, defaults, repo):
-        if not are_ours(repo.get_sources()):
-            return merge(self, defaults, repo)
-        files = repr([dataclasses.astuple(one) for one in defaults])
-        if files not in merged:
-            merged[files] = pickle.dumps(merge(self, defaults, repo))
-        return pickle.loads(merged[files])
-
-    def choices(overrides, defaults, self_added):
-        depends = any(not one.is_self() and not one.is_override() and one.is_interpolation() for one in defaults)
-        return map_of(overrides, defaults, self_added) if depends else None
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ConfigRepository, "load_config", load_config)
-        patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", merge_all)
-        patch.setattr(defaults_list, "_create_interpolation_map", choices)
-        patch.setattr(version, "_get_version", functools.cache(version._get_version))
-        patch.setattr(omegaconf.base, "parse", parse)
-        patch.setattr(omegaconf._utils, "parse", parse)
+    with quick_compositions():
         yield
 
 
@@ -165,20 +115,7 @@ def filmed_once(request, films):
         yield
         return
     from heatsplat.datamodules.synthetic import Synthetic
-    from heatsplat.io.files import write_atomically
-
-    film = Synthetic.load
-
-    def load(self):
-        own = {key: value for key, value in vars(self).items() if key not in ("trainer", "scene") and key[0] != "_"}
-        settings = repr(sorted(own.items()))
-        if settings not in FILMED:
-            file = films / hashlib.sha256(settings.encode()).hexdigest()
-            if not file.exists():
-                write_atomically(file, cloudpickle.dumps(film(self)))
-            FILMED[settings] = pickle.loads(file.read_bytes())
-        return FILMED[settings]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Synthetic, "load", load)
+        patch.setattr(Synthetic, "load", filming_once(Synthetic.load, films))
         yield

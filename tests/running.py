@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
+import pickle
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import cloudpickle
 from omegaconf import DictConfig
 
 from heatsplat.composition import compose, compose_unresolved
+from heatsplat.io.files import write_atomically
 
 NO_PICTURES = ("callbacks.surfaces=null", "callbacks.turntable=null", "callbacks.report.html=false")
 TINY = (
@@ -17,6 +23,26 @@ TINY = (
 def compose_run(*overrides: str, config_name: str = "train") -> DictConfig:
     """The configuration of ``python src/train.py OVERRIDES``, its interpolations not resolved."""
     return compose_unresolved(overrides, config_name)
+
+
+FILMED: dict[str, Any] = {}  # settings of a recording -> the scene, which nobody changes
+
+
+def filming_once(film: Callable, films: Path) -> Callable:
+    """``Synthetic.load``, which is ``film``, for recordings that nobody changes: each is filmed once by all processes that share
+    the folder ``films``."""
+
+    def load(self):
+        own = {key: value for key, value in vars(self).items() if key not in ("trainer", "scene") and key[0] != "_"}
+        settings = repr(sorted(own.items()))
+        if settings not in FILMED:
+            file = films / hashlib.sha256(settings.encode()).hexdigest()
+            if not file.exists():
+                write_atomically(file, cloudpickle.dumps(film(self)))
+            FILMED[settings] = pickle.loads(file.read_bytes())
+        return FILMED[settings]
+
+    return load
 
 
 def run(output_dir: Path, *overrides: str):

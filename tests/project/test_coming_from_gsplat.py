@@ -6,6 +6,7 @@ from functools import reduce
 from pathlib import Path
 
 import pytest
+from running import TINY
 
 import heatsplat
 from heatsplat.composition import compose
@@ -54,7 +55,7 @@ def test_the_renderer_alone_learns_an_image():
 
 
 def test_a_camera_is_led_back_to_its_image(tmp_path):
-    quick = ["data.scene=cooling", "data.size=tiny", "max_steps=200", "threads=1", "test=false", "doctor=false"]
+    quick = ["data.scene=cooling", *TINY, "max_steps=100", "test=false", "doctor=false"]
     heatsplat.train(compose(["method=etgs", *quick]), tmp_path)
     found = {"CHECKPOINT": tmp_path / "checkpoints" / "last.ckpt"}
     exec(EXAMPLES[1], found)

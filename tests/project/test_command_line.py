@@ -1,7 +1,12 @@
-"""The commands as a user types them, from another working directory."""
+"""The commands as a user types them, from another working directory.
+
+A process of its own has what is about processes: exit codes, streams, and a run from its beginning. What a command refuses, and
+what it makes of a finished run, is asked of its function in this process, which has the libraries.
+"""
 
 import inspect
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -14,18 +19,52 @@ import pytest
 from commands import succeeds
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
+from running import NO_PICTURES
 
 from heatsplat import cli, composition
 from heatsplat.contracts import SceneError
 from heatsplat.runs.lock import OccupiedError
 
 ROOT = Path(__file__).resolve().parents[2]
-TINY = ("data.size=tiny", "max_steps=20", "callbacks.probes.times=4", "callbacks.costs.fps_repeats=1")
+TINY = (
+    "data.size=tiny", "max_steps=20", "callbacks.probes.times=4", "callbacks.costs.fps_repeats=1",
+    "callbacks.turntable.frames=4", "callbacks.surfaces.views=4", "callbacks.viewer.cameras=4",
+)  # fmt: skip
 
 
 def command(script: str, *overrides: str, cwd: Path, code: int = 0) -> str:
     """What ``python src/<script>.py`` prints; checks its exit code."""
     return succeeds([str(ROOT / "src" / f"{script}.py"), *overrides], cwd, code, COLUMNS="200")
+
+
+@pytest.fixture
+def told(monkeypatch, capsys):
+    """What a command prints that runs in this process, with what it ends: of a sentence, the exit code is 1."""
+    root = logging.getLogger()
+    handlers = root.handlers[:]
+
+    def of(script: str, *overrides: str, cwd: Path, code: int = 0) -> str:
+        monkeypatch.chdir(cwd)
+        monkeypatch.setenv("COLUMNS", "200")
+        monkeypatch.setattr(cli.sys, "argv", [str(ROOT / "src" / f"{script}.py"), *overrides])
+        capsys.readouterr()
+        said, ended = "", 0
+        try:
+            getattr(cli, script)()
+        except SystemExit as end:
+            said, ended = (end.code, 1) if isinstance(end.code, str) else ("", end.code or 0)
+        shown = capsys.readouterr()
+        output = shown.out + shown.err + said
+        assert ended == code, output
+        return output
+
+    yield of
+    for handler in root.handlers[:]:
+        if handler not in handlers:
+            root.removeHandler(handler)
+            handler.close()
+    for handler in handlers:
+        root.addHandler(handler)
 
 
 @pytest.fixture(scope="module")
@@ -58,14 +97,15 @@ def test_a_run_leaves_what_it_promises(finished):
         assert (finished / link).exists(), f"report.md points to {link}"
 
 
-def test_a_finished_run_is_skipped(finished):
+def test_a_finished_run_is_skipped(finished, told):
     before = (finished / "metrics.json").read_text()
-    assert "has results already" in command("train", "method=etgs", *TINY, f"hydra.run.dir={finished}", cwd=finished)
+    assert "has results already" in told("train", "method=etgs", *TINY, f"hydra.run.dir={finished}", cwd=finished)
     assert (finished / "metrics.json").read_text() == before
 
 
-def test_evaluate_needs_the_checkpoint_only_and_agrees_with_training(finished):
-    command("evaluate", f"ckpt={finished}/checkpoints/last.ckpt", cwd=finished.parent)
+def test_evaluate_needs_the_checkpoint_only_and_agrees_with_training(finished, told):
+    seen = ("callbacks.images=null", "callbacks.viewer=null", "callbacks.probes=null", *NO_PICTURES)
+    told("evaluate", f"ckpt={finished}/checkpoints/last.ckpt", *seen, cwd=finished.parent)
     (again,) = finished.glob("evaluations/*/metrics.json")
     first, second = (json.loads(path.read_text())["test"] for path in (finished / "metrics.json", again))
     assert first["psnr"] == second["psnr"] and first["mae_c"] == second["mae_c"]
@@ -136,8 +176,8 @@ def test_what_export_cannot_take_is_named_before_anything_is_loaded(wrong, tmp_p
         inspect.unwrap(cli.export)(config, tmp_path)
 
 
-def test_render_writes_temperatures_pictures_and_a_video(finished):
-    output = command(
+def test_render_writes_temperatures_pictures_and_a_video(finished, told):
+    output = told(
         "render", f"ckpt={finished}/checkpoints/last.ckpt", "trajectory=orbit", "time=600", "frames=3",
         cwd=finished.parent,
     )  # fmt: skip
@@ -150,9 +190,9 @@ def test_render_writes_temperatures_pictures_and_a_video(finished):
     assert (folder / "video.mp4").stat().st_size > 1000
 
 
-def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path):
-    output = command(
-        "train", "-m", "method=3dgs", "init.opacity=2.0,0.1", *TINY, "test=false",
+def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path, told):
+    output = told(
+        "train", "-m", "method=3dgs", "init.opacity=2.0,0.1", *TINY, "max_steps=4", "doctor=false", "test=false",
         f"hydra.sweep.dir={tmp_path}/sweep", cwd=tmp_path, code=1,
     )  # fmt: skip
     assert "init.opacity must lie in (0, 1)" in output
@@ -167,25 +207,23 @@ def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path):
     ("overrides", "message"),
     [
         (("study=work_precision",), "python src/study.py study=work_precision"),
-        (("method=etgs", "max_stepz=10"), "max_stepz"),
         (("method=etgs", "data=rhd"), "data.root"),
         (("method=etgs", "data=rhd", "data.root=/nowhere/at/all"), "/nowhere/at/all"),
         (("method=3dgs", "ckpt=/nowhere/last.ckpt"), "no checkpoint at /nowhere/last.ckpt"),
         (("method=3dgs", "data.split=every_9th"), "every_9th"),
     ],
 )
-def test_bad_input_is_named_with_exit_code_one(overrides, message, tmp_path):
-    output = command("train", *overrides, f"hydra.run.dir={tmp_path}/run", cwd=tmp_path, code=1)
-    assert message in output
+def test_bad_input_is_named_with_exit_code_one(overrides, message, tmp_path, told):
+    assert message in told("train", *overrides, f"hydra.run.dir={tmp_path}/run", cwd=tmp_path, code=1)
 
 
-def test_help_lists_the_choices(tmp_path):
-    output = command("train", "method=etgs", "--help", cwd=tmp_path)
+def test_help_lists_the_choices(tmp_path, told):
+    output = told("train", "method=etgs", "--help", cwd=tmp_path)
     assert "etgs" in output and "colmap" in output
 
 
-def test_help_of_preparation_lists_its_own_settings_with_their_units(tmp_path):
-    output = command("prepare", "--help", cwd=tmp_path)
+def test_help_of_preparation_lists_its_own_settings_with_their_units(tmp_path, told):
+    output = told("prepare", "--help", cwd=tmp_path)
     assert "reflected_c: null          # apparent reflected temperature, °C" in output
     assert (
         "poses: thermal  # thermal | rgb | given | none" in output
@@ -207,14 +245,14 @@ def test_help_of_preparation_lists_its_own_settings_with_their_units(tmp_path):
         ),
     ],
 )
-def test_what_preparation_cannot_take_is_told_with_the_remedy(arguments, meant, tmp_path):
-    output = command("prepare", *arguments, cwd=tmp_path, code=1)
+def test_what_preparation_cannot_take_is_told_with_the_remedy(arguments, meant, tmp_path, told):
+    output = told("prepare", *arguments, cwd=tmp_path, code=1)
     assert meant in output and "Traceback" not in output and "To append" not in output
 
 
-def test_a_command_without_arguments_shows_how_it_is_used_and_trains_nothing(tmp_path):
+def test_a_command_without_arguments_shows_how_it_is_used_and_trains_nothing(tmp_path, told):
     for script in ("train", "study"):
-        assert f"src/{script}.py {'method' if script == 'train' else 'study'}=" in command(script, cwd=tmp_path, code=2)
+        assert f"src/{script}.py {'method' if script == 'train' else 'study'}=" in told(script, cwd=tmp_path, code=2)
     assert not list(tmp_path.iterdir())
 
 
@@ -232,18 +270,23 @@ def test_a_command_without_arguments_shows_how_it_is_used_and_trains_nothing(tmp
         ("data.ambient_c=20,5", "data.ambient_c=20.5"),
     ],
 )
-def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path):
-    output = command("train", "seed=1", wrong, cwd=tmp_path, code=1)
+def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path, told):
+    output = told("train", "seed=1", wrong, cwd=tmp_path, code=1)
     assert meant in output and "Traceback" not in output
 
 
-def test_a_group_set_to_null_is_told_its_options(tmp_path):
-    output = command("train", "method=etgs", "logger=null", cwd=tmp_path, code=1)
+def test_a_typing_error_ends_a_process_with_its_sentence_and_exit_code_one(tmp_path):
+    output = command("train", "seed=1", "method=etsg", cwd=tmp_path, code=1)
+    assert "Did you mean method=etgs" in output and "Traceback" not in output
+
+
+def test_a_group_set_to_null_is_told_its_options(tmp_path, told):
+    output = told("train", "method=etgs", "logger=null", cwd=tmp_path, code=1)
     assert "logger=null" in output and "none, tensorboard" in output and "Traceback" not in output
 
 
-def test_a_value_that_only_a_scene_shows_to_be_wrong_is_told_in_a_sentence(tmp_path):
-    output = command("train", "method=etgs", *TINY, "thermal.frequencies=-1", "hydra.run.dir=run", cwd=tmp_path, code=1)
+def test_a_value_that_only_a_scene_shows_to_be_wrong_is_told_in_a_sentence(tmp_path, told):
+    output = told("train", "method=etgs", *TINY, "thermal.frequencies=-1", "hydra.run.dir=run", cwd=tmp_path, code=1)
     assert "frequencies must be a whole number of at least 0, got -1" in output and "Traceback" not in output
     assert "Traceback" in (tmp_path / "run" / "FAILED").read_text()
 
@@ -271,8 +314,8 @@ def test_an_option_of_other_methods_is_told_what_it_needs_and_which_have_it(over
         composition.compose(overrides.split())
 
 
-def test_an_option_of_other_methods_is_told_in_a_sentence(tmp_path):
-    output = command("train", "method=etgs", "stages=fine_tuning", *TINY, "hydra.run.dir=run", cwd=tmp_path, code=1)
+def test_an_option_of_other_methods_is_told_in_a_sentence(tmp_path, told):
+    output = told("train", "method=etgs", "stages=fine_tuning", *TINY, "hydra.run.dir=run", cwd=tmp_path, code=1)
     assert (
         "stages=fine_tuning needs first_steps" in output and "Traceback" not in output and "object_type" not in output
     )
@@ -334,9 +377,9 @@ def test_a_mistake_of_ours_keeps_its_traceback(monkeypatch):
             command_that_raises(error, monkeypatch)()
 
 
-def test_results_stay_those_of_their_settings(finished):
+def test_results_stay_those_of_their_settings(finished, told):
     before = {path: path.read_bytes() for path in (finished / ".hydra").iterdir()}
-    told = command("train", "method=etgs", *TINY, "optim.means=1e-3", f"hydra.run.dir={finished}", cwd=finished, code=1)
-    assert "other settings (optim.means)" in told
+    others = ("optim.means=1e-3", f"hydra.run.dir={finished}")
+    assert "other settings (optim.means)" in told("train", "method=etgs", *TINY, *others, cwd=finished, code=1)
     assert len(before) == 3 and before == {path: path.read_bytes() for path in (finished / ".hydra").iterdir()}
     assert not (finished / "FAILED").exists()

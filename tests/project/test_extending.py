@@ -3,17 +3,20 @@
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import succeeds
+from commands import in_turn
+from running import TINY
 
 import heatsplat
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "docs" / "extending.md").read_text()
 FILES = re.findall(r"^`([\w./]+)`\n\n```\w+\n(.*?)^```", TEXT, re.M | re.S)
+OWN_DATA = "python src/train.py method=linear_drift data=npy_folder data.root={} debug=fast data.downscale=1"
 COMMANDS = [line for block in re.findall(r"^```sh\n(.*?)^```", TEXT, re.M | re.S) for line in block.splitlines()]
 
 
@@ -28,10 +31,48 @@ def copy(tmp_path_factory) -> Path:
     return folder
 
 
-def run(copy: Path, command: str) -> str:
-    size = [] if "data=" in command else ["data.size=tiny"]
-    shutil.rmtree(copy / "run", ignore_errors=True)
-    return succeeds([*command.split()[1:], *size, f"hydra.run.dir={copy}/run"], copy)
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    """A folder of images as the page's own data set reads them."""
+    from heatsplat.datamodules.synthetic import Synthetic
+
+    folder = tmp_path_factory.mktemp("recording")
+    scene = Synthetic(scene="cooling", size="tiny").scene
+    camera = scene.train.frames[0].camera
+    frames = sorted(
+        (frame.time_s, views[i]) for views in (scene.train, scene.test) for i, frame in enumerate(views.frames)
+    )
+    start = frames[0][0]
+    for time_s, view in frames:
+        celsius = scene.thermal_range.to_celsius(view.thermal[..., 0]).numpy()
+        np.save(folder / f"{time_s - start:.3f}.npy", celsius)
+    np.savez(
+        folder / "cameras.npz",
+        viewmats=np.stack([view.camera.viewmat.numpy() for _, view in frames]),
+        K=camera.K.numpy(),
+        points=scene.points.numpy(),
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results(copy, recording) -> Callable[[str], dict]:
+    """Of a command the results of its run, of which the files are left out that no test looks at."""
+    tiny, *quick = TINY
+    given = {command: [*command.split()[1:], tiny] for command in COMMANDS}
+    given[OWN_DATA] = OWN_DATA.format(recording).split()[1:]
+    runs = {command: copy / "runs" / f"{number}" for number, command in enumerate(given)}
+    words = [
+        [*given[command], *quick, "max_steps=30", "doctor=false", f"hydra.run.dir={run}"]
+        for command, run in runs.items()
+    ]
+    ended = dict(zip(given, in_turn(words, copy), strict=True))
+
+    def of(command):
+        assert ended[command].returncode == 0, ended[command].output
+        return json.loads((runs[command] / "metrics.json").read_text())
+
+    return of
 
 
 def test_the_page_adds_one_of_each_kind():
@@ -43,17 +84,15 @@ def test_the_page_adds_one_of_each_kind():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_its_commands_run(command, copy):
-    assert "psnr" in run(copy, command)
+def test_its_commands_run(command, results):
+    assert results(command)["test"]["psnr"] > 0
 
 
-def test_what_callbacks_of_the_page_find_stands_in_the_results(copy):
-    def results(callbacks):
-        run(copy, f"python src/train.py method=3dgs callbacks={callbacks} debug=fast")
-        return json.loads((copy / "run" / "metrics.json").read_text())
-
-    assert 0 < results("warmest")["data"]["warmest_c"] < 100
-    scored = results("rmse")
+def test_what_callbacks_of_the_page_find_stands_in_the_results(results):
+    warmest, scored = (
+        results(f"python src/train.py method=3dgs callbacks={name} debug=fast") for name in ("warmest", "rmse")
+    )
+    assert 0 < warmest["data"]["warmest_c"] < 100
     assert scored["test"]["rmse_c"] >= scored["test"]["mae_c"] > 0 and "root" in scored["definitions"]["rmse_c"]
 
 
@@ -71,25 +110,5 @@ def test_parts_outside_of_the_repository_are_trained_and_loaded(tmp_path, monkey
     assert type(trained.module.thermal).__name__ == "LinearDrift"
 
 
-def test_its_data_set_loads(copy, tmp_path):
-    from heatsplat.datamodules.synthetic import Synthetic
-
-    scene = Synthetic(scene="cooling", size="tiny").scene
-    camera = scene.train.frames[0].camera
-    frames = sorted(
-        (frame.time_s, views[i]) for views in (scene.train, scene.test) for i, frame in enumerate(views.frames)
-    )
-    start = frames[0][0]
-    for time_s, view in frames:
-        celsius = scene.thermal_range.to_celsius(view.thermal[..., 0]).numpy()
-        np.save(tmp_path / f"{time_s - start:.3f}.npy", celsius)
-    np.savez(
-        tmp_path / "cameras.npz",
-        viewmats=np.stack([view.camera.viewmat.numpy() for _, view in frames]),
-        K=camera.K.numpy(),
-        points=scene.points.numpy(),
-    )
-    command = (
-        f"python src/train.py method=linear_drift data=npy_folder data.root={tmp_path} debug=fast data.downscale=1"
-    )
-    assert "mae_c" in run(copy, command)
+def test_its_data_set_loads(results):
+    assert results(OWN_DATA)["test"]["mae_c"] > 0

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 from camera_files import temperatures
-from commands import succeeds
-from running import compose_run
+from commands import Done, in_turn, python
+from running import NO_PICTURES, compose_run
 
 from heatsplat import cli
 
@@ -26,9 +26,10 @@ COMMANDS = [
     for line in block.splitlines()
 ]
 PYTHON = [command for command in COMMANDS if command.startswith("python")]
-# What other fast tests run too: sweeps, ablations and tables (tests/studies), budgets and method=auto (tests/training).
+# What other fast tests run too: sweeps, ablations and tables (tests/studies), budgets, presets and method=auto (tests/training).
 LONG = (
     " -m ",
+    "preset=",
     "ablation=",
     "experiment=",
     "budget=",
@@ -37,7 +38,10 @@ LONG = (
     "data.scene=heated",
     "trajectory=view",
 )
+LASTING = [command for command in PYTHON if any(word in command for word in LONG)]
 SHORT = ["data.size=tiny", "max_steps=6", "callbacks.probes=null", "callbacks.costs.fps_repeats=1"]
+UNSEEN = ["callbacks.images=null", "callbacks.viewer=null", *NO_PICTURES]  # files that no test here looks at
+FIRST = "python src/train.py method=etgs"
 
 
 def shell(arguments: list[str], cwd: Path, **environment: str) -> str:
@@ -46,14 +50,6 @@ def shell(arguments: list[str], cwd: Path, **environment: str) -> str:
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout + done.stderr
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Path:
-    """The RUN of the README: a tiny finished run."""
-    folder = tmp_path_factory.mktemp("readme") / "run"
-    succeeds([str(ROOT / "src/train.py"), "method=etgs", *SHORT, f"hydra.run.dir={folder}"])
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -88,46 +84,70 @@ def test_training_commands_compose(command):
     assert method is None or config.name == method[1]
 
 
-@pytest.mark.parametrize(
-    "command",
-    [pytest.param(one, marks=pytest.mark.slow) if any(word in one for word in LONG) else one for one in PYTHON],
-)
-def test_python_commands_run(command, trained, data, tmp_path):
+def words_of(command: str, trained: Path, data: Path, folder: Path) -> list[str]:
+    """A command of the README as it is run here: short, and into a folder."""
     words = command.replace("RUN", f"{trained}").replace("/data/", f"{data}/").split()
     words = [str(ROOT / words[1]), *words[2:]]
     if "train.py" in command:
         words += SHORT if "data=" not in command and "experiment=" not in command else SHORT[1:]
-        words += [f"hydra.run.dir={tmp_path}/run", f"hydra.sweep.dir={tmp_path}/sweep"]
+        words += [*UNSEEN, "doctor=false", f"hydra.run.dir={folder}/run", f"hydra.sweep.dir={folder}/sweep"]
         if "budget=" in command:  # which counts the steps itself
             words = [word for word in words if not word.startswith(("max_steps=", "budget="))] + ["budget=20s"]
         if "experiment=" in command:  # some of its methods
             words += ["table.methods=[3dgs,etgs]"]
         if "ablation=" in command:  # one seed
             words += ["hydra.sweeper.params={seed:'0'}"]
+    elif "evaluate.py" in command:
+        words += [*UNSEEN, f"hydra.run.dir={folder}/done"]
     elif "prepare.py" in command:
-        words = [*words[:1], f"source={data}/flight", f"target={tmp_path}/prepared", "poses=none"]  # of two frames
+        words = [*words[:1], f"source={data}/flight", f"target={folder}/prepared", "poses=none"]  # of two frames
     elif "render.py" in command:
-        words += ["frames=2", f"hydra.run.dir={tmp_path}/views"]
+        words += ["frames=2", f"hydra.run.dir={folder}/views"]
     else:
-        words += [f"hydra.run.dir={tmp_path}/done"]
-    output = succeeds(words, tmp_path)
+        words += [f"hydra.run.dir={folder}/done"]
+    return words
+
+
+@pytest.fixture(scope="module")
+def ended(data, tmp_path_factory) -> dict[str, tuple[Done, Path]]:
+    """What became of the commands that take seconds, and the folder of each. The first one's run is RUN of those that follow."""
+    folders = {command: tmp_path_factory.mktemp("command") for command in PYTHON if command not in LASTING}
+    trained = folders[FIRST] / "run"
+    done = in_turn([words_of(command, trained, data, folder) for command, folder in folders.items()], trained.parent)
+    return dict(zip(folders, zip(done, folders.values(), strict=True), strict=True))
+
+
+def check_done(command: str, done: Done, folder: Path) -> None:
+    assert done.returncode == 0, done.output
     if "train.py" in command or "evaluate.py" in command:
-        assert "psnr" in output
+        assert "psnr" in done.output
         jobs = {" -m ": 3, "ablation=": 5, "experiment=": 2}
         expected = next((count for word, count in jobs.items() if word in command), 1)
-        assert len(list(tmp_path.rglob("metrics.json"))) == expected
+        assert len(list(folder.rglob("metrics.json"))) == expected
     elif "study.py" in command:
-        assert (tmp_path / "done" / "frontier.html").exists()
+        assert (folder / "done" / "frontier.html").exists()
     elif "prepare.py" in command:
-        assert (tmp_path / "prepared" / "report.md").exists()
+        assert (folder / "prepared" / "report.md").exists()
     elif "simplify.py" in command:
-        assert (tmp_path / "done" / "lod_1.ckpt").exists() and (tmp_path / "done" / "lod_1.ply").exists()
+        assert (folder / "done" / "lod_1.ckpt").exists() and (folder / "done" / "lod_1.ply").exists()
     elif "export.py" in command:
-        assert len(list((tmp_path / "done").glob("*.ply"))) == 1
+        assert len(list((folder / "done").glob("*.ply"))) == 1
     elif "view.py" in command:
-        assert (tmp_path / "done" / "viewer.html").exists()
+        assert (folder / "done" / "viewer.html").exists()
     else:
-        assert (tmp_path / "views" / "video.mp4").exists()
+        assert (folder / "views" / "video.mp4").exists()
+
+
+@pytest.mark.parametrize("command", [command for command in PYTHON if command not in LASTING])
+def test_python_commands_run(command, ended):
+    check_done(command, *ended[command])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", LASTING)
+def test_python_commands_that_take_longer_run(command, ended, data, tmp_path):
+    words = words_of(command, ended[FIRST][1] / "run", data, tmp_path)
+    check_done(command, python(words, tmp_path), tmp_path)
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")

@@ -28,6 +28,12 @@ def open_browser(width: int = 800, height: int = 560):
     for argument in ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", size):
         options.add_argument(argument)
     options.add_argument("--disable-dev-shm-usage")
+    options.add_argument("--force-device-scale-factor=0.5")  # a quarter of the pixels, which the processor draws
+    for argument in (
+        "--disable-gpu-compositing",
+        "--disable-gpu-rasterization",
+    ):  # of what is no WebGL: a third of the time
+        options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
     browser.set_script_timeout(60)

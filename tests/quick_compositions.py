@@ -1,0 +1,108 @@
+"""Hydra's compositions without what it does anew for each: the suite composes more than a thousand times."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import os
+import pickle
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+from unittest import mock
+
+import hydra
+import omegaconf
+from hydra import version
+from hydra._internal import defaults_list
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import ConfigRepository
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+
+from heatsplat.composition import CONF
+
+
+@contextmanager
+def quick_compositions() -> Iterator[None]:
+    """While it lasts, a composition takes a quarter of its 0.25 s, and one that is asked for again next to nothing.
+
+    What is found beside further folders (``hydra.searchpath``) is read anew; tests write those.
+    """
+    parse = functools.cache(omegaconf.base.parse)
+    read, merge = ConfigRepository.load_config, ConfigLoaderImpl._compose_config_from_defaults_list
+    replaced = (
+        (hydra, "compose", _composed_once(hydra.compose)),
+        (ConfigRepository, "load_config", _once(read, lambda self, path: (self.sources, path))),
+        (ConfigLoaderImpl, "_compose_config_from_defaults_list", _once(merge, _files)),
+        (defaults_list, "_create_interpolation_map", _where_needed(defaults_list._create_interpolation_map)),
+        (version, "_get_version", functools.cache(version._get_version)),  # asked for eight hundred times
+        (omegaconf.base, "parse", parse),
+        (omegaconf._utils, "parse", parse),
+    )
+    added = (
+        (omegaconf.base.Metadata, "__deepcopy__", _copied),
+        (ConfigStore, "__deepcopy__", lambda self, memo: self),  # it copies what it gives
+    )
+    with ExitStack() as stack:
+        for owner, name, function in replaced:
+            stack.enter_context(mock.patch.object(owner, name, function))
+        for owner, name, function in added:
+            stack.enter_context(mock.patch.object(owner, name, function, create=True))
+        yield
+
+
+def _composed_once(compose: Callable) -> Callable:
+    """``hydra.compose``; planning a budget composes the same five times."""
+    known: dict[Any, bytes] = {}  # as bytes here and below: what is returned gets changed
+
+    def composed(config_name=None, overrides=(), return_hydra_config=False):
+        places = [place.path for place in GlobalHydra.instance().config_loader().get_search_path().get_path()]
+        files = [place.removeprefix("file://") for place in places if not place.startswith(("pkg://", "structured://"))]
+        if files != [CONF] or any("searchpath" in text for text in overrides):
+            return compose(config_name, list(overrides), return_hydra_config)
+        key = config_name, tuple(overrides), return_hydra_config, os.getcwd()
+        if key not in known:
+            known[key] = pickle.dumps(compose(config_name, list(overrides), return_hydra_config))
+        return pickle.loads(known[key])
+
+    return composed
+
+
+def _once(function: Callable, about: Callable) -> Callable:
+    """A function of files: ``about`` says from which sources, and what tells one call from another."""
+    known: dict[Any, bytes] = {}
+
+    def called(*arguments):
+        sources, key = about(*arguments)
+        if [source.path for source in sources if source.scheme() == "file"] != [CONF]:
+            return function(*arguments)
+        if key not in known:
+            known[key] = pickle.dumps(function(*arguments))
+        return pickle.loads(known[key])
+
+    return called
+
+
+def _files(self: Any, defaults: Any, repo: Any) -> tuple[Any, str]:
+    return repo.get_sources(), repr([dataclasses.astuple(one) for one in defaults])
+
+
+def _where_needed(map_of: Callable) -> Callable:
+    """A map of all choices, which Hydra makes for each of some thirty files and reads only where a default depends on another."""
+
+    def choices(overrides, defaults, self_added):
+        depends = any(not one.is_self() and not one.is_override() and one.is_interpolation() for one in defaults)
+        return map_of(overrides, defaults, self_added) if depends else None
+
+    return choices
+
+
+def _copied(self: Any, memo: dict[int, Any]) -> Any:
+    """What OmegaConf knows of a node, copied attribute by attribute: names, types and flags, thousands of times."""
+    new = object.__new__(type(self))
+    cache = copy.deepcopy(self.resolver_cache, memo) if self.resolver_cache else defaultdict(dict)
+    new.__dict__.update(self.__dict__, flags=copy.copy(self.flags), resolver_cache=cache)
+    return new
