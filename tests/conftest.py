@@ -1,15 +1,18 @@
 """Test processes side by side (pytest -n) share the cores; a synthetic scene is filmed once in each of them."""
 
+import copy
 import functools
 import logging
 import os
 import pickle
 import signal
+from collections import defaultdict
 
 import omegaconf
 import pytest
 from hydra._internal import defaults_list
 from hydra._internal.config_repository import ConfigRepository
+from hydra.core.config_store import ConfigStore
 
 from heatsplat.composition import CONF
 from heatsplat.training.machine import cores, prepare_machine
@@ -103,7 +106,9 @@ def configurations_read_once():
     each, half of that parsing.
 
     What is found beside further folders (``hydra.searchpath``) is read anew; tests write those. And Hydra makes a map of all
-    choices for each of some thirty files, a fifth of the time, which it reads only where a default depends on another.
+    choices for each of some thirty files, a fifth of the time, which it reads only where a default depends on another. What
+    is left are copies: those of what every node says of itself hold nothing but names, types and flags, and go attribute by
+    attribute; the store of Hydra's own settings copies what it gives, and is not copied itself.
     """
     read, known = ConfigRepository.load_config, {}
     map_of = defaults_list._create_interpolation_map
@@ -116,6 +121,13 @@ def configurations_read_once():
             known[config_path] = pickle.dumps(read(self, config_path))  # what is returned gets changed
         return pickle.loads(known[config_path])
 
+    def copied(self, memo):
+        new = object.__new__(type(self))
+        new.__dict__.update(self.__dict__)
+        new.flags = None if self.flags is None else dict(self.flags)
+        new.resolver_cache = copy.deepcopy(self.resolver_cache, memo) if self.resolver_cache else defaultdict(dict)
+        return new
+
     def choices(overrides, defaults, self_added):
         depends = any(not one.is_self() and not one.is_override() and one.is_interpolation() for one in defaults)
         return map_of(overrides, defaults, self_added) if depends else None
@@ -123,6 +135,8 @@ def configurations_read_once():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ConfigRepository, "load_config", load_config)
         patch.setattr(defaults_list, "_create_interpolation_map", choices)
+        patch.setattr(omegaconf.base.Metadata, "__deepcopy__", copied, raising=False)
+        patch.setattr(ConfigStore, "__deepcopy__", lambda self, memo: self, raising=False)
         patch.setattr(omegaconf.base, "parse", parse)
         patch.setattr(omegaconf._utils, "parse", parse)
         yield
