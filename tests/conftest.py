@@ -8,11 +8,13 @@ import pickle
 import signal
 from collections import defaultdict
 
+import hydra
 import omegaconf
 import pytest
 from hydra._internal import defaults_list
 from hydra._internal.config_repository import ConfigRepository
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 
 from heatsplat.composition import CONF
 from heatsplat.training.machine import cores, prepare_machine
@@ -108,11 +110,13 @@ def configurations_read_once():
     What is found beside further folders (``hydra.searchpath``) is read anew; tests write those. And Hydra makes a map of all
     choices for each of some thirty files, a fifth of the time, which it reads only where a default depends on another. What
     is left are copies: those of what every node says of itself hold nothing but names, types and flags, and go attribute by
-    attribute; the store of Hydra's own settings copies what it gives, and is not copied itself.
+    attribute; the store of Hydra's own settings copies what it gives, and is not copied itself. A composition that is asked
+    for again, from the same working directory, is the first one, copied: planning a budget composes the same five times.
     """
     read, known = ConfigRepository.load_config, {}
     map_of = defaults_list._create_interpolation_map
     parse = functools.cache(omegaconf.base.parse)
+    compose, composed = hydra.compose, {}
 
     def load_config(self, config_path):
         if [source.path for source in self.sources if source.scheme() == "file"] != [CONF]:
@@ -120,6 +124,16 @@ def configurations_read_once():
         if config_path not in known:
             known[config_path] = pickle.dumps(read(self, config_path))  # what is returned gets changed
         return pickle.loads(known[config_path])
+
+    def compose_once(config_name=None, overrides=(), return_hydra_config=False):
+        places = [place.path for place in GlobalHydra.instance().config_loader().get_search_path().get_path()]
+        files = [place.removeprefix("file://") for place in places if not place.startswith(("pkg://", "structured://"))]
+        if files != [CONF] or any("searchpath" in text for text in overrides):
+            return compose(config_name, list(overrides), return_hydra_config)
+        key = config_name, tuple(overrides), return_hydra_config, os.getcwd()
+        if key not in composed:
+            composed[key] = pickle.dumps(compose(config_name, list(overrides), return_hydra_config))
+        return pickle.loads(composed[key])
 
     def copied(self, memo):
         new = object.__new__(type(self))
@@ -135,6 +149,7 @@ def configurations_read_once():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ConfigRepository, "load_config", load_config)
         patch.setattr(defaults_list, "_create_interpolation_map", choices)
+        patch.setattr(hydra, "compose", compose_once)
         patch.setattr(omegaconf.base.Metadata, "__deepcopy__", copied, raising=False)
         patch.setattr(ConfigStore, "__deepcopy__", lambda self, memo: self, raising=False)
         patch.setattr(omegaconf.base, "parse", parse)

@@ -17,7 +17,7 @@ from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import differences, on_scene, resumed
 from heatsplat.training.checkpoints import load_checkpoint
 
-QUICK = (*TINY, "method=3dgs", "max_steps=8", "data.downscale=4", "trainer.limit_test_batches=1")
+QUICK = (*TINY, "method=3dgs", "max_steps=8", "data.downscale=4", "data.frames=9", "trainer.limit_test_batches=1")
 QUICK = (*QUICK, "callbacks.metrics.lpips_net=null", "callbacks.costs.fps_repeats=1", "callbacks.statistics=null")
 
 
