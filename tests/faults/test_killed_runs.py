@@ -2,7 +2,6 @@
 
 import json
 import os
-import random
 
 import pytest
 import pytorch_lightning as pl
@@ -19,7 +18,7 @@ SHORT = (
     "method=3dgs", "data.size=tiny", "data.frames=9", "data.downscale=4", "max_steps=8", "threads=1", "callbacks.images=null",
     "callbacks.probes=null", "callbacks.costs.fps_repeats=1", "callbacks.costs.warmup_steps=1", "callbacks.statistics=null",
     "callbacks.metrics.lpips_net=null", "trainer.val_check_interval=4", "callbacks.report.show=false",
-    "callbacks.progress.enabled=false", "callbacks.viewer=null", *NO_PICTURES,
+    "callbacks.progress.enabled=false", "callbacks.viewer=null", "doctor=false", *NO_PICTURES,
 )  # fmt: skip
 
 
@@ -61,7 +60,7 @@ def check_goes_on(config, folder, whole):
     assert (folder / "report.md").exists()
 
 
-@pytest.mark.parametrize("step", random.Random(0).sample(range(1, 9), 2))
+@pytest.mark.parametrize("step", (1, 7))  # before the first checkpoint, and between two
 def test_killed_while_it_trains(config, whole, tmp_path, monkeypatch, step):
     with monkeypatch.context() as patch:
         patch.setattr(run, "build_callbacks", with_more(run.build_callbacks, KillAfter(step)))

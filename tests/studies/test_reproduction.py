@@ -411,7 +411,7 @@ def command(*overrides: str, code: int = 0) -> str:
 SHORT = (
     "max_steps=4", "threads=1", "data.downscale=2", "trainer.val_check_interval=4", "trainer.limit_val_batches=1",
     "trainer.limit_test_batches=2", "callbacks.images=null", "callbacks.probes=null", "callbacks.costs.fps_repeats=1",
-    "callbacks.viewer=null", *NO_PICTURES,
+    "callbacks.viewer=null", "doctor=false", *NO_PICTURES,
 )  # fmt: skip
 
 

@@ -265,7 +265,7 @@ def test_a_sweep_runs_all_rows_survives_a_failure_and_goes_on_where_it_stopped(t
     command = [
         TRAIN, "-m", "method=etgs", "data.size=tiny", "data.downscale=2",
         "max_steps=4", "seed=0", "threads=1", "callbacks.images=null", "callbacks.probes=null", "callbacks.viewer=null",
-        *NO_PICTURES, f"hydra.sweeper.rows={rows}",
+        *NO_PICTURES, "doctor=false", f"hydra.sweeper.rows={rows}",
         "hydra.sweeper.paper={of:etgs,table:'4',scenes:[average]}",
         f"hydra.sweep.dir={tmp_path}/sweep",
     ]  # fmt: skip
@@ -283,7 +283,8 @@ def test_folders_of_jobs_with_many_overrides_have_names_that_fit(tmp_path):
     ]
     command = [
         TRAIN, "-m", "method=etgs", "data.size=tiny", "data.downscale=2",
-        "max_steps=2", "seed=0", *many, *NO_PICTURES, "thermal.source_penalty=0.000000000000000000000000000000000001", "test=false",
+        "max_steps=2", "seed=0", *many, *NO_PICTURES, "doctor=false",
+        "thermal.source_penalty=0.000000000000000000000000000000000001", "test=false",
         "callbacks.metrics.lpips_net=null", "callbacks.costs.fps_repeats=1", f"hydra.sweep.dir={tmp_path}/sweep",
     ]  # fmt: skip
     succeeds(command)
