@@ -18,6 +18,12 @@ NO_PICTURES = ("callbacks.surfaces=null", "callbacks.turntable=null", "callbacks
 TINY = (
     "data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "callbacks.viewer=null", *NO_PICTURES, "threads=1",
 )  # fmt: skip
+# Training alone, for tests that look at the trained module: nothing is measured or logged; and nothing is stored.
+QUIET = (
+    *TINY, "callbacks.costs=null", "callbacks.statistics=null", "callbacks.dashboard=null", "callbacks.progress.enabled=false",
+    "logger=none", "trainer.limit_val_batches=0", "test=false",
+)  # fmt: skip
+BARE = (*QUIET, "callbacks.checkpoint=null", "callbacks.checkpoint_end=null")
 
 
 def compose_run(*overrides: str, config_name: str = "train") -> DictConfig:

@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 from helpers import OF_GAUSSIANS
-from running import TINY, run
+from running import BARE, QUIET, run
 
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.module import CHECKPOINT_KEY, SplatTraining
@@ -22,15 +22,22 @@ RULES = {
 GATHERED = {"multiview_gate": ("gradient", "seen"), "budget": ("score", "wrong", "weight"), "mcmc": ()}
 
 
+BRIEF = {  # the same in ten steps
+    "multiview_gate": (
+        "density.start=2", "density.every=4", "density.views=2", "density.stop=8", "density.late_every=4", "density.late_stop=12",
+    ),
+    "budget": ("density.start=2", "density.every=4", "density.stop=9", "density.remove_at=[1,7]"),
+    "mcmc": ("density.start=2", "density.every=4", "density.stop=12"),
+}  # fmt: skip
+
+
 def overrides(rule: str, *more: str) -> tuple[str, ...]:
     return (
-        *TINY,
+        *QUIET,
         f"density={rule}",
         *RULES[rule],
-        "max_steps=40",
-        "optim.length_power=0",  # rates of 30 000 steps in 40 would be 27 times the papers'
-        "test=false",
-        "trainer.val_check_interval=40",
+        "max_steps=26",
+        "optim.length_power=0",  # rates of 30 000 steps in 26 would be 34 times the papers'
         *more,
     )
 
@@ -63,8 +70,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(rule, method, vie
 
 def test_a_run_that_sums_gradients_of_views_moves_at_every_second_step_and_resumes_between_them(tmp_path, monkeypatch):
     given = (
-        *TINY, "method=etgs", "density=fixed", "optim=adamw", "optim.decoupled.opacity=0.1", "optim.accumulate=2",
-        "max_steps=12", "test=false", "trainer.val_check_interval=12", "callbacks.checkpoint.every_n_train_steps=9",
+        *QUIET, "method=etgs", "density=fixed", "optim=adamw", "optim.decoupled.opacity=0.1", "optim.accumulate=2",
+        "max_steps=12", "callbacks.checkpoint.every_n_train_steps=9",
     )  # fmt: skip
     opacities = []
     end = SplatTraining.on_train_batch_end
@@ -119,7 +126,7 @@ def test_opacities_are_reset_while_they_are_trained(method, more, resets, tmp_pa
         "density.reset_every=10",
         "density.prune_opacity=0",
     )
-    given = (*TINY, "density=adaptive", *every, "max_steps=40", "test=false", "trainer.limit_val_batches=0")
+    given = (*BARE, "density=adaptive", *every, "max_steps=40")
     run(tmp_path, *given, f"method={method}", *more)
     assert steps == resets
 
@@ -133,6 +140,7 @@ PAIRS = [  # every method of Gaussians under one of the rules; under the others 
 
 @pytest.mark.parametrize(("rule", "method"), PAIRS)
 def test_every_method_lives_through_every_rule(rule, method, tmp_path):
-    module, _ = run(tmp_path, *overrides(rule, f"method={method}", "max_steps=22"))
+    given = (*BARE, f"density={rule}", *RULES[rule], *BRIEF[rule], "max_steps=10", "optim.length_power=0")
+    module, _ = run(tmp_path, *given, f"method={method}")
     assert len(module.splats) > 0
     assert all(bool(torch.isfinite(module.splats[name]).all()) for name in module.splats.names)

@@ -2,11 +2,11 @@
 
 import json
 import os
-import random
 
 import pytest
 import pytorch_lightning as pl
 import torch
+from running import NO_PICTURES
 from test_checkpoint_files import disk_of
 
 from heatsplat import composition
@@ -15,10 +15,10 @@ from heatsplat.runs import lock, run
 from heatsplat.training.checkpoints import load_checkpoint
 
 SHORT = (
-    "method=3dgs", "data.size=tiny", "data.downscale=4", "max_steps=8", "threads=1", "callbacks.images=null",
+    "method=3dgs", "data.size=tiny", "data.frames=9", "data.downscale=4", "max_steps=8", "threads=1", "callbacks.images=null",
     "callbacks.probes=null", "callbacks.costs.fps_repeats=1", "callbacks.costs.warmup_steps=1", "callbacks.statistics=null",
     "callbacks.metrics.lpips_net=null", "trainer.val_check_interval=4", "callbacks.report.show=false",
-    "callbacks.progress.enabled=false",
+    "callbacks.progress.enabled=false", "callbacks.viewer=null", "doctor=false", *NO_PICTURES,
 )  # fmt: skip
 
 
@@ -60,7 +60,7 @@ def check_goes_on(config, folder, whole):
     assert (folder / "report.md").exists()
 
 
-@pytest.mark.parametrize("step", random.Random(0).sample(range(1, 9), 3))
+@pytest.mark.parametrize("step", (1, 7))  # before the first checkpoint, and between two
 def test_killed_while_it_trains(config, whole, tmp_path, monkeypatch, step):
     with monkeypatch.context() as patch:
         patch.setattr(run, "build_callbacks", with_more(run.build_callbacks, KillAfter(step)))
@@ -75,7 +75,7 @@ def with_more(build, callback):
 
 
 # Files that a run writes as a whole, and which of them is cut off.
-WRITES = ("step_000002.ckpt", "step_000006.ckpt", "last.ckpt", "report.md", "metrics.json")
+WRITES = ("step_000002.ckpt", "last.ckpt", "report.md", "metrics.json")
 
 
 @pytest.mark.parametrize("name", WRITES)

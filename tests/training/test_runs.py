@@ -67,17 +67,18 @@ def test_interruption_leaves_a_checkpoint_that_resumes(tmp_path, monkeypatch):
         listen(self, trainer, *rest)
 
     monkeypatch.setattr(session.StopOnInterrupt, "on_train_batch_end", interrupt_at_seven)
+    brief = ("max_steps=12", "trainer.limit_val_batches=0", "callbacks.costs=null", "logger=none")
     with pytest.raises(SystemExit) as stopped:
-        run(tmp_path, *SHORT, "method=3dgs")
+        run(tmp_path, *SHORT, *brief, "method=3dgs")
     assert stopped.value.code == 130
     last = tmp_path / "checkpoints" / "last.ckpt"
     assert load_checkpoint(last)["global_step"] == 7 == steps[-1]
-    _, trainer = run(tmp_path / "on", *SHORT, "method=3dgs", "test=false", f"ckpt={last}")
-    assert trainer.global_step == 40
+    _, trainer = run(tmp_path / "on", *SHORT, *brief, "method=3dgs", "test=false", f"ckpt={last}")
+    assert trainer.global_step == 12
 
 
 def test_a_checkpoint_of_another_method_is_refused(tmp_path):
-    run(tmp_path / "etgs", *SHORT, "method=etgs", "test=false")
+    run(tmp_path / "etgs", *SHORT, "method=etgs", "test=false", "max_steps=2", "trainer.limit_val_batches=0")
     last = tmp_path / "etgs" / "checkpoints" / "last.ckpt"
     with pytest.raises(SceneError, match="method 'etgs', this run is method '3dgs'"):
         run(tmp_path / "3dgs", *SHORT, "method=3dgs", "data.scene=cooling", f"ckpt={last}")
