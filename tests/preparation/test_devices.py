@@ -23,6 +23,7 @@ from heatsplat.preparation.frames import read_recording
 from heatsplat.preparation.poses import FindPoses
 from heatsplat.preparation.prepare import prepare
 
+pytestmark = pytest.mark.usefixtures("dots_for_pictures")
 PLAIN = {"conditions": {}, "uncertainty": {}, "counts": {}}
 DEAD = {"a": (0, 6), "b": (5, 7)}  # seed and number of the dead pixels of either camera
 
