@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import running
 
@@ -20,6 +21,12 @@ POINTS = [
     for growth, mean_growth, scores in ((1.0, 1.0, (20, 24, 26)), (FREE, 4.0, (18, 26, 32)))
     for steps, psnr in zip((250, 1000, 4000), scores, strict=True)
 ]
+
+
+@pytest.fixture(autouse=True)
+def grey_for_pictures(monkeypatch):
+    """Drawing the curves takes a second of each study; the tables' test makes the figure itself."""
+    monkeypatch.setattr(budget_grid, "figure_picture", lambda figure: np.zeros((1, 1, 3), np.uint8))
 
 
 def a_run(steps: int, cap: int | None, seed: int, psnr: float, seconds: float) -> Trained:

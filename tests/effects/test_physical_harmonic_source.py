@@ -18,7 +18,7 @@ def inspected(name, **recorded):
 
 @pytest.fixture(scope="module")
 def heated():
-    return inspected("heated", size="tiny", frames=72)  # small images, as many as of a larger scene
+    return inspected("heated", size="tiny", frames=40)
 
 
 def test_a_lamp_gives_all_points_one_course_which_is_its_own(heated):

@@ -10,6 +10,8 @@ from heatsplat.datamodules.points import random_points, told_random
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
+from heatsplat.effects import swept_points as module
+from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import decide
 from heatsplat.effects.swept_points import swept_points, with_swept_points
 
@@ -21,8 +23,18 @@ def without_points(name: str) -> SceneData:
     return replace(scene, points=torch.from_numpy(points).float(), point_colors=None, notes=notes)
 
 
-def test_points_lie_on_surfaces_of_a_scene_that_cools_meanwhile():
-    points = swept_points(without_points("cooling"))
+@pytest.fixture(scope="module")
+def cooling() -> SceneData:
+    return without_points("cooling")
+
+
+@pytest.fixture(scope="module")
+def swept(cooling) -> torch.Tensor:
+    return swept_points(cooling)
+
+
+def test_points_lie_on_surfaces_of_a_scene_that_cools_meanwhile(swept):
+    points = swept
     on_surface, _ = Scene(PRESETS["cooling"]).nearest(points)
     away = (on_surface - points).norm(dim=1)  # in metres, from 2.2 m and at 64 pixels a pixel is 3 cm
     assert len(points) > 300 and away.median() < 0.03 and away.quantile(0.8) < 0.06
@@ -33,17 +45,26 @@ def test_a_scene_with_points_keeps_them():
     assert with_swept_points(scene) is scene
 
 
-@pytest.mark.parametrize(
-    ("name", "effects"), [("static", set()), ("cooling", {"relaxation"}), ("drifting", {"frame_offset"})]
-)
-def test_effects_are_told_as_with_points_of_the_scene(name, effects):
-    verdicts = decide(without_points(name))
+def test_effects_are_told_as_with_points_of_the_scene(cooling, swept, monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "swept_points", lambda scene: asked.append(scene) or swept)
+    are_told(decide(cooling), {"relaxation"})
+    assert asked == [cooling]  # swept again, the same would be found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "effects"), [("static", set()), ("drifting", {"frame_offset"})])
+def test_effects_of_other_scenes_are_told_as_with_points(name, effects):
+    are_told(decide(without_points(name)), effects)
+
+
+def are_told(verdicts: dict[str, Verdict], effects: set[str]) -> None:
     assert {effect for effect, verdict in verdicts.items() if verdict.on} == effects
     assert all(verdicts[effect].told for effect in effects)
 
 
-def test_nothing_is_told_where_images_show_no_texture():
-    scene = without_points("cooling")
+def test_nothing_is_told_where_images_show_no_texture(cooling):
+    scene = cooling
 
     def flat(views: ViewSet) -> ViewSet:
         def decode(position: int) -> View:

@@ -78,6 +78,7 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
         return ((reference + x) ** 4 - reference**4) / (4 * reference**3)
 
     ends = np.unique(np.concatenate((times, moments.numpy())))
+    ends = ends[ends <= moments.max().item()]
     behind = surface.start if surface.core is None else surface.core.start
     state = np.concatenate((surface.start.numpy(), behind.numpy()))
     found = {ends[0]: state[:count]}

@@ -1,6 +1,7 @@
 """Recordings of two thermal cameras: each has a lens, dead pixels and counts of its own."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import read_model
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, dead_pixels, write_camera
-from heatsplat.datamodules.synthetic_scene.film import Size, film
+from heatsplat.datamodules.synthetic_scene.film import Recording, Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.preparation.devices import devices_of
@@ -23,18 +24,23 @@ from heatsplat.preparation.frames import read_recording
 from heatsplat.preparation.poses import FindPoses
 from heatsplat.preparation.prepare import prepare
 
+pytestmark = pytest.mark.usefixtures("dots_for_pictures")
 PLAIN = {"conditions": {}, "uncertainty": {}, "counts": {}}
 DEAD = {"a": (0, 6), "b": (5, 7)}  # seed and number of the dead pixels of either camera
 
 
-def write_two(folder: Path, frames: int = 8, cut: bool = False) -> tuple[float, float]:
+@cache
+def filmed() -> tuple[Recording, ...]:
+    of_both = ((0, 160, 128), (1, 240, 192))
+    return tuple(film(Scene(PRESETS["static"]), Size(w, h, 6, 60), seed) for seed, w, h in of_both)
+
+
+def write_two(folder: Path, cut: bool = False) -> tuple[float, float]:
     """Two cameras that filmed the same room, in folders a and b: 160x128 pixels, and 240x192 or the middle of it.
 
     Returns their focal lengths in pixels.
     """
-    one, other = (
-        film(Scene(PRESETS["static"]), Size(w, h, frames, 60), seed) for seed, w, h in ((0, 160, 128), (1, 240, 192))
-    )
+    one, other = filmed()
     if cut:
         lens = replace(other.lens, width=160, height=128, cx=other.lens.cx - 40.0, cy=other.lens.cy - 32.0)
         other = replace(other, celsius=other.celsius[:, 32:160, 40:200], lens=lens)
@@ -104,7 +110,7 @@ def test_the_doctor_looks_at_each_camera_s_files(tmp_path):
 
 
 def test_what_is_of_one_camera_alone_is_refused_for_two(tmp_path):
-    write_two(tmp_path / "files", frames=4)
+    write_two(tmp_path / "files")
     frames = read_frames(tmp_path / "files")
     (tmp_path / "scene" / "images").mkdir(parents=True)
     for options in ({"by": "rgb"}, {"focal_px": 200.0}):

@@ -13,6 +13,7 @@ from heatsplat.doctor.base import material_of
 from heatsplat.preparation.given_poses import GivenPoses
 from heatsplat.preparation.prepare import prepare
 
+pytestmark = pytest.mark.usefixtures("dots_for_pictures")
 PLAIN = {"conditions": {}, "uncertainty": {}, "counts": {}}
 OPENCV = ("OPENCV", (60.0, 61.0, 39.0, 33.0, 0.05, -0.01, 0.001, 0.002), 80, 64)  # at twice the frames' size
 FISHEYE = ("OPENCV_FISHEYE", (30.0, 30.0, 20.0, 16.0, 0.01, 0.0, 0.0, 0.0), 40, 32)

@@ -23,6 +23,7 @@ from heatsplat.preparation.poses import FindPoses
 from heatsplat.preparation.prepare import prepare
 from heatsplat.preparation.report import Section
 
+pytestmark = pytest.mark.usefixtures("dots_for_pictures")
 ROOT = Path(__file__).resolve().parents[2]
 PINHOLE = ("PINHOLE", (38.0, 38.0, 20.0, 16.0), 40, 32)
 PLAIN = {"conditions": {}, "uncertainty": {}, "counts": {}}

@@ -13,6 +13,7 @@ from heatsplat.preparation.prepare import prepare
 from heatsplat.preparation.report import Section
 from heatsplat.preparation.target import CORRECTED, PREPARED, RECORD, Target
 
+pytestmark = pytest.mark.usefixtures("dots_for_pictures")
 PLAIN = {"conditions": {}, "uncertainty": {}, "counts": {}}
 IMAGES = {f"{i}.tiff": np.full((8, 8), 20.0 + i, np.float32) for i in range(3)}
 
