@@ -2,12 +2,16 @@
 
 import errno
 import os
+from pathlib import Path
 
 import pytest
+import yaml
 from hydra.errors import ConfigCompositionException, OverrideParseException
 
 from heatsplat import composition
 from heatsplat.explanations import _quoted, expected, explain, sentence
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.parametrize(
@@ -42,3 +46,15 @@ def test_a_disk_that_takes_no_file_needs_no_traceback(code):
     error = OSError(code, os.strerror(code), "/read/only/run.log")
     assert expected(error) is error and sentence(error).startswith("/read/only/run.log: ")
     assert expected(OSError(errno.EIO, "broken")) is None
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("conf/*.yaml")), ids=lambda path: path.stem)
+def test_no_number_or_text_of_a_command_has_the_name_of_a_group(path):
+    """Hydra would take ``cameras=2`` for an option of conf/cameras."""
+    groups = {folder.name for folder in (ROOT / "conf").iterdir() if folder.is_dir()}
+    settings = yaml.safe_load(path.read_text())
+    assert [key for key, value in settings.items() if key in groups and not isinstance(value, dict)] == []
+
+
+def test_a_page_with_few_training_cameras_can_be_asked_for():
+    assert composition.compose(["ckpt=a.ckpt", "training_cameras=2"], "view")["training_cameras"] == 2

@@ -309,9 +309,9 @@ def view(config: dict[str, Any], output_dir: Path) -> None:
     """Writes viewer.html of a checkpoint's scene, which a browser opens offline."""
     from heatsplat.viewer.page import FILE, write_viewer
 
-    check_count("cameras", config["cameras"])
+    check_count("training_cameras", config["training_cameras"])
     trained = _load(config, output_dir)
-    path = write_viewer(trained.module, output_dir / FILE, config["cameras"])
+    path = write_viewer(trained.module, output_dir / FILE, config["training_cameras"])
     log.info("%s (%.1f MB): open it in a browser", path, path.stat().st_size / 1e6)
 
 
