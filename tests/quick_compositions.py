@@ -35,7 +35,7 @@ def quick_compositions() -> Iterator[None]:
     read, merge = ConfigRepository.load_config, ConfigLoaderImpl._compose_config_from_defaults_list
     replaced = (
         (hydra, "compose", _composed_once(hydra.compose)),
-        (ConfigRepository, "load_config", _once(read, lambda self, path: (self.sources, path))),
+        (ConfigRepository, "load_config", _once(read, lambda self, config_path: (self.sources, config_path))),
         (ConfigLoaderImpl, "_compose_config_from_defaults_list", _once(merge, _files)),
         (defaults_list, "_create_interpolation_map", _where_needed(defaults_list._create_interpolation_map)),
         (version, "_get_version", functools.cache(version._get_version)),  # asked for eight hundred times
@@ -75,12 +75,12 @@ def _once(function: Callable, about: Callable) -> Callable:
     """A function of files: ``about`` says from which sources, and what tells one call from another."""
     known: dict[Any, bytes] = {}
 
-    def called(*arguments):
-        sources, key = about(*arguments)
+    def called(self, **arguments):
+        sources, key = about(self, **arguments)
         if [source.path for source in sources if source.scheme() == "file"] != [CONF]:
-            return function(*arguments)
+            return function(self, **arguments)
         if key not in known:
-            known[key] = pickle.dumps(function(*arguments))
+            known[key] = pickle.dumps(function(self, **arguments))
         return pickle.loads(known[key])
 
     return called
