@@ -1,4 +1,4 @@
-"""Test processes side by side (pytest -n) share the cores; a synthetic scene is filmed once in each of them."""
+"""Test processes side by side (pytest -n) share the cores and the films of synthetic scenes; each composes a setting once."""
 
 import logging
 import os
