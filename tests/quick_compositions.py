@@ -27,7 +27,7 @@ from heatsplat.composition import CONF
 
 @contextmanager
 def quick_compositions() -> Iterator[None]:
-    """While it lasts, a composition takes a quarter of its 0.25 s, and one that is asked for again next to nothing.
+    """While it lasts, a composition takes 0.1 s in place of 0.25 s, and one that is asked for again next to nothing.
 
     What is found beside further folders (``hydra.searchpath``) is read anew; tests write those.
     """

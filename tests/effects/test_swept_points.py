@@ -48,19 +48,20 @@ def test_a_scene_with_points_keeps_them():
 def test_effects_are_told_as_with_points_of_the_scene(cooling, swept, monkeypatch):
     asked = []
     monkeypatch.setattr(module, "swept_points", lambda scene: asked.append(scene) or swept)
-    are_told(decide(cooling), {"relaxation"})
+    assert told(decide(cooling)) == {"relaxation"}
     assert asked == [cooling]  # swept again, the same would be found
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "effects"), [("static", set()), ("drifting", {"frame_offset"})])
 def test_effects_of_other_scenes_are_told_as_with_points(name, effects):
-    are_told(decide(without_points(name)), effects)
+    assert told(decide(without_points(name))) == effects
 
 
-def are_told(verdicts: dict[str, Verdict], effects: set[str]) -> None:
-    assert {effect for effect, verdict in verdicts.items() if verdict.on} == effects
-    assert all(verdicts[effect].told for effect in effects)
+def told(verdicts: dict[str, Verdict]) -> set[str]:
+    """The effects that are on, each of which the images have to tell."""
+    assert all(verdict.told for verdict in verdicts.values() if verdict.on)
+    return {effect for effect, verdict in verdicts.items() if verdict.on}
 
 
 def test_nothing_is_told_where_images_show_no_texture(cooling):

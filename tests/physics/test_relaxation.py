@@ -26,7 +26,7 @@ def vector(*values, dtype=DOUBLE):
 )
 def test_values_and_slopes_over_the_whole_range(dtype, bound, relative):
     worst = torch.zeros(4)
-    for rate, omega, time in zip(*(x[::3].tolist() for x in draw(1500, seed=1)), strict=True):
+    for rate, omega, time in zip(*(x.tolist() for x in draw(1500, seed=1)), strict=True):
         arguments = vector(rate, dtype=dtype), vector(omega), scalar(time)
         reference = exact(rate, omega, time)
         values = [x.item() for x in harmonic_response(*arguments)]
@@ -85,7 +85,7 @@ omegas = st.one_of(edges, st.floats(1e-5, 3e2))
 times = st.one_of(st.sampled_from([-1e5, -1.0, -1e-9, 0.0, 1e-12, 1e-8]), st.floats(1e-3, 1e5))
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=300, deadline=None, derandomize=True)
 @given(rates, omegas, times)
 @example(1.0, 1e-12, 1.0)  # on the border between series and closed form
 @example(1e-30, 0.0, 1e5)
@@ -188,7 +188,7 @@ def test_temperature_solves_its_equation():
         source = sine * torch.sin(omega * t) + cosine * torch.cos(omega * t)
         return -rate * (state - ambient) + source.sum(1)
 
-    steps, end = 1500, 60.0
+    steps, end = 4000, 60.0
     h, state = end / steps, initial
     for i in range(steps):
         t = i * h

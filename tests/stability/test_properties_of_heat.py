@@ -35,7 +35,7 @@ def double(*values: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("dtype", JOINT, ids=str)
-@settings(max_examples=100)
+@settings(max_examples=250)
 @given(rates, omegas, times)
 @example(1.0, 1e-12, 1.0)
 @example(1e4, 1e-5, 1e5)
@@ -59,7 +59,7 @@ def test_responses_and_slopes_keep_their_digits(dtype, rate, omega, time):
         assert joint_error(slopes, truth[2:]) <= 2 * JOINT[dtype]
 
 
-@settings(max_examples=60)
+@settings(max_examples=150)
 @given(omegas, times)
 def test_without_decay_the_responses_are_those_of_an_integral(omega, time):
     sine, cosine = (x.item() for x in harmonic_response(double(0.0), double(omega), double(time)[0]))
@@ -69,7 +69,7 @@ def test_without_decay_the_responses_are_those_of_an_integral(omega, time):
         assert abs(sine - expected[0]) + abs(cosine - expected[1]) <= 4e-16 * sum(map(abs, expected))
 
 
-@settings(max_examples=60)
+@settings(max_examples=150)
 @given(rates, times)
 def test_without_frequency_the_response_is_that_to_a_constant(rate, time):
     sine, cosine = (x.item() for x in harmonic_response(double(rate), double(0.0), double(time)[0]))
@@ -77,7 +77,7 @@ def test_without_frequency_the_response_is_that_to_a_constant(rate, time):
     assert cosine == pytest.approx(-math.expm1(-rate * time) / rate if rate > 1e-300 else time, rel=1e-15)
 
 
-@settings(max_examples=40)
+@settings(max_examples=100)
 @given(logarithmic(1e-12, 1e4, 0.0, 1e-45, 1e-30), logarithmic(1e-5, 3e2), logarithmic(1e-3, 1e5), st.booleans())
 def test_the_fused_kernel_keeps_its_digits(rate, omega, time, scaled):
     assert omega >= SMALLEST_OMEGA
@@ -94,7 +94,7 @@ def test_the_fused_kernel_keeps_its_digits(rate, omega, time, scaled):
 
 
 @pytest.mark.parametrize("dtype", JOINT, ids=str)
-@settings(max_examples=80)
+@settings(max_examples=200)
 @given(rates, times, st.floats(-40, 150), st.floats(-40, 150))
 def test_relaxation_stays_between_its_ends_and_meets_them(dtype, rate, time, ambient_c, initial_c):
     ambient, initial = (torch.tensor(x + 273.15, dtype=dtype) for x in (ambient_c, initial_c))
@@ -110,7 +110,7 @@ def test_relaxation_stays_between_its_ends_and_meets_them(dtype, rate, time, amb
 
 
 @pytest.mark.parametrize("dtype", JOINT, ids=str)
-@settings(max_examples=60)
+@settings(max_examples=150)
 @given(
     st.one_of(st.floats(-80, 30), st.sampled_from([-80.0, 30.0, -69.0776])),
     logarithmic(1e-5, 3e2, 0.0), st.one_of(times, times.map(lambda t: -t)),
@@ -132,7 +132,7 @@ def test_gradients_by_everything_are_finite(dtype, log_rate, omega, time):
 
 
 @pytest.mark.parametrize("dtype", JOINT, ids=str)
-@settings(max_examples=40)
+@settings(max_examples=100)
 @given(logarithmic(1e-9, 100.0, 0.0), st.sampled_from([-1.0, 1.0]))
 def test_radiation_near_the_reference_keeps_its_digits(dtype, excess, sign):
     found = power_excess(double(sign * excess).to(dtype), 288.0).item()
@@ -141,7 +141,7 @@ def test_radiation_near_the_reference_keeps_its_digits(dtype, excess, sign):
     assert abs(found - truth) <= 4 * torch.finfo(dtype).eps * abs(truth)
 
 
-@settings(max_examples=40)
+@settings(max_examples=100)
 @given(logarithmic(1e-13, 1e9, 0.0))
 def test_weights_of_a_step_keep_their_digits(y):
     """Rates from 1e-9 to 1e4 1/s and steps from 0.01 s to an hour, and beyond."""
@@ -153,7 +153,7 @@ def test_weights_of_a_step_keep_their_digits(y):
     assert max(abs(a - b) for a, b in zip((decay, before, after), truth, strict=True)) <= 4e-16
 
 
-@settings(max_examples=16)
+@settings(max_examples=40)
 @given(
     logarithmic(1e-9, 1e4), logarithmic(0.01, 3600.0), st.floats(-20, 60), st.one_of(st.none(), st.floats(0.01, 0.99)),
 )  # fmt: skip
@@ -174,7 +174,7 @@ def test_a_stiff_balance_neither_rings_nor_leaves_the_range_of_what_drives_it(ra
         assert found.item() == pytest.approx(0.0, abs=0.01)
 
 
-@settings(max_examples=80)
+@settings(max_examples=200)
 @given(
     st.lists(logarithmic(1e-3, 1e9, 0.0), min_size=2, max_size=12), st.integers(1, 30), logarithmic(1e-6, 1e6),
     st.one_of(st.floats(1e-3, 1), st.sampled_from([1.0, 1 - 2**-53, 1e-3])),
@@ -205,7 +205,7 @@ SENT = {
 
 
 @pytest.mark.parametrize("dtype", SENT, ids=str)
-@settings(max_examples=16)
+@settings(max_examples=40)
 @given(logarithmic(1.0, 1e4, 300.0), logarithmic(1.0, 1000.0, 7.5))
 @example(1e4, 1e5)  # far beyond, where e^x - 1 is all rounding
 @example(1.0, 1.0)
@@ -222,7 +222,7 @@ def test_what_a_black_body_sends_keeps_its_digits(dtype, temperature, wavelength
 
 
 @pytest.mark.parametrize("dtype", SENT, ids=str)
-@settings(max_examples=16)
+@settings(max_examples=40)
 @given(logarithmic(12.0, 9.9e3, 300.0), st.sampled_from(BANDS))
 def test_a_temperature_is_found_again_in_what_it_sends(dtype, temperature, band):
     radiance = band.radiance(double(temperature).to(dtype)).requires_grad_()
@@ -236,7 +236,7 @@ def test_a_temperature_is_found_again_in_what_it_sends(dtype, temperature, band)
     assert radiance.grad.item() * kelvins.grad.item() == pytest.approx(1, rel=50 * SENT[dtype])
 
 
-@settings(max_examples=40)
+@settings(max_examples=100)
 @given(st.lists(st.one_of(logarithmic(1e-45, 3e38, 0.0), st.floats(-1e3, 0)), min_size=2, max_size=8))
 def test_temperatures_rise_with_radiance_whatever_it_is(values):
     radiances = double(*sorted(values)).requires_grad_()

@@ -26,9 +26,7 @@ log = logging.getLogger("heatsplat")
 
 SCORE_FILE, SUBMISSION = "score.json", "submission"
 WIDTH = 2.0  # standard errors of a difference below which two methods are tied
-PRIOR = (
-    2.0  # degrees of freedom that the usual spread of a scene counts for: two seeds alike by chance are no certainty
-)
+PRIOR = 2.0  # degrees of freedom of a scene's usual spread: two seeds alike by chance are no certainty
 
 
 @dataclass(frozen=True)
