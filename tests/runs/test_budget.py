@@ -539,7 +539,7 @@ def prepared(folder: Path, *overrides: str, settings: tuple[str, ...] = BLIND) -
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("slower", [0.5, 2.5])
+@pytest.mark.parametrize("slower", [0.4, 1.0, 2.5])
 def test_whole_runs_end_within_a_tenth_of_their_time_whatever_the_calibration_saw(tmp_path, monkeypatch, slower):
     Hours(monkeypatch, slower)
     module, _ = running.run(tmp_path, *BLIND)
