@@ -32,8 +32,9 @@ def test_the_table_has_ranks_reasons_and_costs(tmp_path):
         "Scene size: tiny; 4 runs, 0.01 h of CPU time in total; seeds 0, 1. On a busy machine." in text
         and "steps taken: `2,000`" in text
     )
-    assert "| `3dgs` | 1.00 | 1 | 10 | **1.100 (1–2)** | – |" in text
-    assert "| `etgs` | 1.05 | 1 | 10 | **1.150 (1–2)** | – |" in text  # tied
+    assert "| `3dgs` | 1.00 | 1 | 10 | 900 | 1,000 | **1.100 (1–2)** | – |" in text
+    assert "| `etgs` | 1.05 | 1 | 10 | 900 | 1,000 | **1.150 (1–2)** | – |" in text  # tied
+    assert "| method | x 3dgs | scenes | s (CPU time) | peak MB | Gaussians | cooling | driven |" in text
     assert "- `etgs` on driven: scene 'x' lacks weather" in text
     assert (
         "- `3dgs` on driven: not run yet" in text

@@ -15,7 +15,15 @@ from heatsplat.io.pictures import ERROR, THERMAL, colorize, data_uri
 from heatsplat.io.tiff import read_temperature
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.leaderboard.plan import Board
-from heatsplat.studies.leaderboard.standings import SUBMISSION, Entry, Standings, beside_reference, spread_of, summary
+from heatsplat.studies.leaderboard.standings import (
+    SUBMISSION,
+    Entry,
+    Standings,
+    beside_reference,
+    mean_costs,
+    spread_of,
+    summary,
+)
 from heatsplat.studies.score import ENDINGS, TRUTH
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -54,7 +62,8 @@ def page(found: Standings, board: Board, folder: Path | None) -> str:
         ],
         "entries": [_told(entry, board, folder) for entry in entries],
         "beside": [
-            {"method": method, "track": track, "beside": value, "scenes": count}
+            {"method": method, "track": track, "beside": value, "scenes": count,
+             "cost": mean_costs([entry for entry in entries if (entry.method, entry.track) == (method, track)])}
             for (method, track), (value, count) in sorted(
                 beside.items(), key=lambda item: item[1][0], reverse=board.higher
             )

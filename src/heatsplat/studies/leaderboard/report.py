@@ -12,7 +12,15 @@ from heatsplat.io.tables import NONE, markdown_table, number, write_csv
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.leaderboard.page import page
 from heatsplat.studies.leaderboard.plan import Board
-from heatsplat.studies.leaderboard.standings import Entry, Standings, beside_reference, spread_of, standings, summary
+from heatsplat.studies.leaderboard.standings import (
+    Entry,
+    Standings,
+    beside_reference,
+    mean_costs,
+    spread_of,
+    standings,
+    summary,
+)
 
 log = logging.getLogger("heatsplat")
 
@@ -106,11 +114,10 @@ def _table(entries: Sequence[Entry], board: Board, track: str) -> list[str]:
         if not any(one and one.seeds for one in own):
             continue
         value, count = beside.get((method, track), (None, 0))
-        seconds = [one.cost("seconds") for one in own if one and one.cost("seconds") is not None]
-        told = number(sum(seconds) / len(seconds) if seconds else None, 0)
-        rows.append([f"`{method}`", number(value, 2), count, told, *(_cell(one, board.score) for one in own)])
-    head = ["method", _beside(board), "scenes", f"s ({_clock(board)})", *scenes]
-    return markdown_table(head, rows, "lrrr" + "r" * len(scenes))
+        costs = (number(cost, 0) for cost in mean_costs(own).values())
+        rows.append([f"`{method}`", number(value, 2), count, *costs, *(_cell(one, board.score) for one in own)])
+    head = ["method", _beside(board), "scenes", f"s ({_clock(board)})", "peak MB", "Gaussians", *scenes]
+    return markdown_table(head, rows, "l" + "r" * (len(head) - 1))
 
 
 def rank_text(entry: Entry) -> str:

@@ -20,7 +20,7 @@ from heatsplat.studies.finished import reason_of
 from heatsplat.studies.leaderboard.earlier import EarlierSeeds, Place, add_earlier, sentence
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.recorded import OVERRIDES, overrides_of
-from heatsplat.studies.score import SCENES, TRUTH, SceneScore, score_scene
+from heatsplat.studies.score import COSTS, SCENES, TRUTH, SceneScore, score_scene
 
 log = logging.getLogger("heatsplat")
 
@@ -317,6 +317,15 @@ def beside_reference(entries: Sequence[Entry], board: Board) -> dict[tuple[str, 
                 found.setdefault((method, track), []).append(beside)
     means = {key: (statistics.fmean(values), len(values)) for key, values in found.items()}
     return means if board.higher else {key: (math.exp(mean), count) for key, (mean, count) in means.items()}
+
+
+def mean_costs(entries: Sequence[Entry | None]) -> dict[str, float | None]:
+    """Seconds, memory_mb and gaussians in the mean over those of a method's scenes where they are known; None for none."""
+    found = {}
+    for name in COSTS:
+        known = [cost for one in entries if one and (cost := one.cost(name)) is not None]
+        found[name] = statistics.fmean(known) if known else None
+    return found
 
 
 def summary(entries: Sequence[Entry], board: Board) -> dict[str, Any]:
