@@ -1,5 +1,6 @@
 """Test processes side by side (pytest -n) share the cores and the films of synthetic scenes; each composes a setting once."""
 
+import gc
 import logging
 import os
 import signal
@@ -10,6 +11,8 @@ from quick_compositions import quick_compositions
 from running import filming_once
 
 from heatsplat.training.machine import cores, prepare_machine
+
+gc.disable()  # until all is collected: modules and thousands of tests are no garbage
 
 WORKERS = os.environ.get("PYTEST_XDIST_WORKER_COUNT")
 if WORKERS:  # before torch is imported, which reads it once
@@ -63,8 +66,13 @@ LONGEST = (
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config):
-    """One process more than there are cores: tests wait for commands that they start."""
-    return cores() + 1
+    """A process per core: loading the libraries takes longer than what is waited for."""
+    return cores()
+
+
+def pytest_collection_finish():
+    gc.freeze()  # they are not looked through again
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items):

@@ -29,7 +29,7 @@ from heatsplat.io.files import write_atomically
 from heatsplat.io.results import FAILED, METRICS_FILE
 from heatsplat.runs.lock import OccupiedError, locked
 from heatsplat.runs.signals import stoppable
-from heatsplat.training.machine import prepare_machine
+from heatsplat.training.machine import loading, prepare_machine
 
 if TYPE_CHECKING:
     from heatsplat.runs.run import Trained
@@ -176,7 +176,8 @@ def _prepare_machine(threads: int | None) -> None:
 
 def _load(config: dict[str, Any], output_dir: Path) -> Trained:
     """The trained scene of the checkpoint that a command was given, with the data and the weather that it was given."""
-    from heatsplat.runs.run import load
+    with loading():
+        from heatsplat.runs.run import load
 
     _prepare_machine(config["threads"])
     weather = {key: config[key] for key in ("weather", "weather_zone") if key in config}
@@ -194,7 +195,8 @@ def _write_down(config: DictConfig, hydra_config: DictConfig, folder: Path) -> N
 @_job
 def train(config: dict[str, Any], output_dir: Path) -> float | None:
     """Trains a method on a scene, tests it and writes the report. Returns the test PSNR, for sweepers."""
-    from heatsplat.runs.run import train_in
+    with loading():
+        from heatsplat.runs.run import train_in
 
     if (chosen := HydraConfig.get().runtime.choices.study) is not None:
         raise SceneError(f"a study has a command of its own: python src/study.py study={chosen}")
@@ -227,8 +229,9 @@ def check_vacant(config: DictConfig, output_dir: Path) -> None:
 @functools.partial(_job, check=check_vacant)
 def evaluate(config: dict[str, Any], output_dir: Path) -> float | None:
     """Measures the test views of a checkpoint. Returns the test PSNR."""
-    from heatsplat.runs.device import device_of
-    from heatsplat.runs.run import build_trainer
+    with loading():
+        from heatsplat.runs.device import device_of
+        from heatsplat.runs.run import build_trainer
 
     trained = _load(config, output_dir)
     own = "auto" if "backend" in trained.config["renderer"] else None  # not the backend of the machine that trained it

@@ -1,5 +1,6 @@
-"""Which cores a process takes."""
+"""Which cores a process takes, and how it loads libraries."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -44,3 +45,19 @@ def test_the_command_line_counts_by_the_same_rule_and_loads_nothing_heavy_for_it
     heavy = "{'torch', 'numba', 'pytorch_lightning'} & set(sys.modules)"
     told = f"import sys, heatsplat.cli; heatsplat.compose; sys.exit(bool({heavy}))"
     assert subprocess.run([sys.executable, "-c", told], env={**os.environ, "PYTHONPATH": str(SRC)}).returncode == 0
+
+
+def test_libraries_are_left_out_of_the_search_for_garbage_once(monkeypatch):
+    """What a second job of a process leaves behind is found."""
+    calls = []
+    for name in ("disable", "freeze", "enable"):
+        monkeypatch.setattr(gc, name, lambda name=name: calls.append(name))
+    monkeypatch.setattr(gc, "get_freeze_count", lambda: 0)
+    with pytest.raises(ImportError), machine.loading():
+        assert calls == ["disable"]
+        raise ImportError("half of it")
+    assert calls == ["disable", "freeze", "enable"]
+    monkeypatch.setattr(gc, "get_freeze_count", lambda: 5)
+    with machine.loading():
+        pass
+    assert calls == ["disable", "freeze", "enable"]

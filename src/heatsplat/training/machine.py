@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 # Lightning's remarks that no user can act on: workers, its products, a deprecation of torch, checkpoints of another
 # folder, SLURM where a run was started by hand, loaders that cannot resume (ours takes the step from the trainer, so
@@ -33,6 +36,24 @@ def usual_threads() -> int:
     """Threads of a process that was told no number: OMP_NUM_THREADS, as all of OpenMP takes it; else a core each."""
     given = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # a number for each level of nesting
     return int(given) if given.isdecimal() and int(given) > 0 else cores()
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """The first time in a process, what is loaded meanwhile is left out of the search for garbage, then and later on.
+
+    There is none among libraries, and the search takes a third of the time in which a command loads them. Later it would
+    keep what jobs of a sweep have left behind.
+    """
+    if gc.get_freeze_count():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def prepare_machine(threads: int | None) -> None:
