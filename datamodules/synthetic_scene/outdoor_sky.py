@@ -6,6 +6,7 @@ The sky's long waves follow air temperature and humidity; sun and sky are split 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -51,6 +52,7 @@ SKIES: dict[str, Sky] = {
 }
 
 
+@cache  # a scene asks for it several times
 def outdoor_weather(name: str, start_s: float = 0.0, end_s: float = DURATION_S) -> Weather:
     """The weather of a sky in ``SKIES`` every ten minutes, on the clock of the record; the same bits on every call.
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Protocol
 
 import torch
@@ -37,8 +38,20 @@ class Shape(Protocol):
     def bounds(self) -> tuple[Point, float] | None: ...
 
 
+@cache  # small tensors take as long to make as to compute with
 def _row(point: Point) -> Tensor:
     return torch.tensor(point, dtype=torch.float64)
+
+
+@cache
+def _turn(yaw_deg: float, tilt_deg: float) -> Tensor:
+    """Rotation [3, 3]: a tilt about x, then a turn about z."""
+    c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
+    yaw = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    if not tilt_deg:
+        return yaw
+    c, s = math.cos(math.radians(tilt_deg)), math.sin(math.radians(tilt_deg))
+    return yaw @ torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]], dtype=torch.float64)
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -133,12 +146,7 @@ class Box:
 
     def rotation(self) -> Tensor:
         """Rotation [3, 3] from the box's axes to the world's."""
-        c, s = math.cos(math.radians(self.yaw_deg)), math.sin(math.radians(self.yaw_deg))
-        yaw = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-        if not self.tilt_deg:
-            return yaw
-        c, s = math.cos(math.radians(self.tilt_deg)), math.sin(math.radians(self.tilt_deg))
-        return yaw @ torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]], dtype=torch.float64)
+        return _turn(self.yaw_deg, self.tilt_deg)
 
     def intersect(self, origins: Tensor, directions: Tensor) -> Tensor:
         turn = self.rotation()

@@ -58,13 +58,13 @@ def test_a_flawless_camera_records_the_clean_image():
 
 @pytest.fixture(scope="module")
 def noisy():
-    return Synthetic(scene="noisy_sensor", size="tiny").scene
+    return Synthetic(scene="noisy_sensor", size="tiny", frames=9).scene
 
 
 def test_views_of_the_noisy_sensor_know_their_clean_record(noisy):
     flaws = PRESETS["noisy_sensor"].flaws
-    recording = film(Scene(PRESETS["noisy_sensor"]), Size(64, 52, 19, 600))
-    clean = film(Scene(replace(PRESETS["noisy_sensor"], flaws=None)), Size(64, 52, 19, 600), noise_k=0.0)
+    recording = film(Scene(PRESETS["noisy_sensor"]), Size(64, 52, 9, 600))
+    clean = film(Scene(replace(PRESETS["noisy_sensor"], flaws=None)), Size(64, 52, 9, 600), noise_k=0.0)
     assert clean.thermal_range == recording.thermal_range
     assert np.array_equal(recording.clean, clean.celsius) and clean.clean is None
     for view in (noisy.train[0], noisy.test[1]):
@@ -77,10 +77,10 @@ def test_views_of_the_noisy_sensor_know_their_clean_record(noisy):
 
 
 def test_other_views_know_of_no_clean_record_but_are_their_own():
-    view = Synthetic(scene="static", size="tiny").scene.train[0]
+    view = Synthetic(scene="static", size="tiny", frames=2).scene.train[0]
     assert view.clean is None and view.image("clean") is view.thermal
 
 
 def test_a_smaller_scene_has_smaller_clean_records():
-    view = Synthetic(scene="noisy_sensor", size="tiny", downscale=2.0).scene.train[3]
+    view = Synthetic(scene="noisy_sensor", size="tiny", frames=5, downscale=2.0).scene.train[3]
     assert view.clean.shape == view.thermal.shape == (26, 32, 1)

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from running import TINY, run
+from running import BARE, run
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic import Synthetic
@@ -130,20 +130,17 @@ def in_the_pane(module) -> dict[str, float]:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """What a run makes of the scene with so many opacities, once for each number."""
+    """What a run of so many steps makes of the scene with so many opacities, once for each pair of numbers."""
 
     @cache
-    def of(opacities: int):
+    def of(opacities: int, steps: int):
         short = (
-            *TINY,
+            *BARE,
             "method=ravigs",
             "data.scene=glass",
-            "max_steps=600",
+            f"max_steps={steps}",
             "density.cap_max=2000",
-            "trainer.val_check_interval=600",
             "callbacks.attributes=null",
-            "test=false",
-            "threads=1",
         )
         module, _ = run(tmp_path_factory.mktemp("glass"), *short, f"thermal.dual_opacity={opacities == 2}")
         assert module.splats.opacities.shape[0] == opacities
@@ -155,25 +152,22 @@ def trained(tmp_path_factory):
 @pytest.mark.slow
 def test_one_opacity_fails_in_the_pane_and_two_do_not(trained):
     """Measured: 34.3 dB heat and 30.4 dB colour with two, 31.6 dB and 24.2 dB with one."""
-    two, one = in_the_pane(trained(2)), in_the_pane(trained(1))
+    two, one = in_the_pane(trained(2, 600)), in_the_pane(trained(1, 600))
     assert two["thermal"] > 33.0 and two["rgb"] > 29.0
     assert two["thermal"] - one["thermal"] > 1.5 and two["rgb"] - one["rgb"] > 4.0
 
 
 def test_the_pane_is_dense_to_heat_and_thin_to_light(trained):
     """Measured: medians of 0.27 and 0.018, which co-support leaves standing."""
-    splats = trained(2).splats
+    splats = trained(2, 250).splats
     _, which = Scene(PRESETS["glass"]).nearest(splats.means.detach().double())
     heat, light = splats.opacities.detach()[:, which == len(TABLE_TOP)].median(1).values.tolist()
     assert heat > 5 * light > 5 * 0.005
 
 
 def test_only_the_pixels_of_a_surface_count_when_it_is_named():
-    views, recording = (
-        Synthetic(scene="glass", size="tiny", only="pane").scene.test,
-        film(Scene(PRESETS["glass"]), SIZES["tiny"]),
-    )
-    for view in views:
-        assert torch.equal(view.mask, torch.from_numpy(recording.shows(view.frame.frame_id, "pane")))
+    views = Synthetic(scene="glass", size="tiny", frames=SMALL.frames, only="pane").scene
+    for view in (*views.train, *views.test):
+        assert torch.equal(view.mask, torch.from_numpy(recorded("glass").shows(view.frame.frame_id, "pane")))
     with pytest.raises(SceneError, match="data.only=window: scene 'glass' has floor, wall, .*pane"):
-        Synthetic(scene="glass", size="tiny", only="window").load()
+        Synthetic(scene="glass", size="tiny", frames=2, only="window").load()

@@ -163,8 +163,8 @@ def test_the_first_day_trains_and_the_second_tests():
     assert scene.weather.times_s[0] < 0.0 < scene.test.times_s[-1] < scene.weather.times_s[-1]
     for frame in (*scene.train.frames, *scene.test.frames):
         assert frame.environment == scene.weather.at(frame.time_s)
-    mixed = Synthetic(scene="outdoor", size="tiny", split="every_8th").scene
-    assert len(mixed.test) == 3 and mixed.notes["split"] == "every_8th"
+    mixed = Synthetic(scene="outdoor", size="tiny", frames=9, split="every_8th").scene
+    assert len(mixed.test) == 2 and mixed.notes["split"] == "every_8th"
 
 
 def test_a_longer_record_begins_like_a_short_one_and_holds_out_its_last_day():
@@ -172,20 +172,20 @@ def test_a_longer_record_begins_like_a_short_one_and_holds_out_its_last_day():
     roof, times = torch.tensor([[0.9, -1.2, 5.5]], dtype=torch.float64), torch.tensor([0.2, 0.9, 1.6]) * DAY_S
     # The same solver and the same forcing; only how far it refines is decided by the whole record.
     torch.testing.assert_close(long.truth(roof, times), short.truth(roof, times), rtol=0, atol=0.02)
-    scene = Synthetic(scene="outdoor", size="tiny", days=3).scene
+    scene = Synthetic(scene="outdoor", size="tiny", frames=7, days=3).scene
     zero = scene.weather.notes["utc_at_zero_s"]
     days = [{(zero + t) // DAY_S - zero // DAY_S for t in views.times_s} for views in (scene.train, scene.test)]
-    assert days == [{0, 1}, {2}] and (len(scene.train), len(scene.test)) == (13, 6)
+    assert days == [{0, 1}, {2}] and (len(scene.train), len(scene.test)) == (5, 2)
     assert scene.weather.times_s[-1] - scene.weather.times_s[0] == 3 * DAY_S
 
 
 @pytest.mark.parametrize(("hours", "inside"), [((20, 4), lambda h: h >= 20 or h < 4), ((9, 17), lambda h: 9 <= h < 17)])
 def test_images_of_some_hours_keep_the_days_that_are_held_out_and_the_weather_of_all(hours, inside):
-    scene, always = Synthetic(scene="outdoor", size="tiny", hours=hours).scene, tiny()
+    scene = Synthetic(scene="outdoor", size="tiny", frames=7, hours=hours).scene
     zero = scene.weather.notes["utc_at_zero_s"]
-    for day, views, others in ((0, scene.train, always.train), (1, scene.test, always.test)):
+    for day, views, count in ((0, scene.train, 5), (1, scene.test, 2)):  # as many as of a scene of all hours
         seconds = np.array(views.times_s) + zero
-        assert len(views) == len(others) and (np.diff(seconds) > 0).all()
+        assert len(views) == count and (np.diff(seconds) > 0).all()
         assert all(inside(hour) for hour in seconds % DAY_S / 3600)
         assert {s // DAY_S - START_UTC_S // DAY_S for s in seconds} == {day}
     assert scene.weather.times_s[-1] - scene.weather.times_s[0] == 2 * DAY_S

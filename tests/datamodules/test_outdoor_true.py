@@ -10,7 +10,7 @@ import torch
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.outdoor_sky import SKIES, cloud_cover, series
-from heatsplat.datamodules.synthetic_scene.outdoor_true import TRUE, OutdoorTrueScene, sky_of, true_weather
+from heatsplat.datamodules.synthetic_scene.outdoor_true import TRUE, YARDS, OutdoorTrueScene, sky_of, true_weather
 from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C, STEFAN_BOLTZMANN
 
 
@@ -93,8 +93,9 @@ def test_by_night_the_sky_is_as_cloudy_as_the_clouds_that_take_light_by_day():
     assert 0.7 < share[night].min() < 0.85
 
 
-def test_the_scene_trains_on_the_first_days_and_tells_of_clouds_and_rain_what_a_station_would():
-    scene = Synthetic(scene="outdoor_true", size="tiny").scene
+def test_the_scene_trains_on_the_first_days_and_tells_of_clouds_and_rain_what_a_station_would(monkeypatch):
+    monkeypatch.setitem(YARDS, "outdoor_true", (OutdoorTrueScene, world().preset))
+    scene = Synthetic(scene="outdoor_true", size="tiny", frames=6).scene
     zero = scene.weather.notes["utc_at_zero_s"]
     days = [{(zero + t) // DAY_S for t in views.times_s} for views in (scene.train, scene.test)]
     assert max(days[0]) < min(days[1]) and len(days[1]) == 1

@@ -40,7 +40,7 @@ def band_radiance(celsius):
 
 def test_weak_texture_has_few_points_off_their_surfaces_and_none_on_what_is_bare():
     preset = PRESETS["weak_texture"]
-    size = replace(SIZES["tiny"], frames=8, points=SIZES["demo"].points)
+    size = Size(16, 13, 8, SIZES["demo"].points)
     recording, plain = (film(Scene(p), size) for p in (preset, replace(preset, point_noise_m=0.0)))
     assert 20 < len(recording.points) < 200
     _, which = plain.scene.nearest(torch.from_numpy(plain.points))
@@ -74,7 +74,7 @@ def test_fog_weakens_by_its_water_and_the_true_distance():
 
 
 def test_in_fog_the_camera_comes_near_and_goes_away():
-    recording = film(Scene(PRESETS["fog"]), replace(SIZES["tiny"], frames=40), noise_k=0.0)
+    recording = film(Scene(PRESETS["fog"]), Size(8, 6, 40, 16), noise_k=0.0)
     centers = np.linalg.inv(recording.viewmats)[:, :3, 3]
     apart = np.linalg.norm(centers - (0.0, 0.15, 0.3), axis=1)
     assert apart.min() < 1.75 and apart.max() > 2.65
@@ -83,7 +83,7 @@ def test_in_fog_the_camera_comes_near_and_goes_away():
 
 def test_a_fading_sensor_has_one_gain_for_each_image_that_walks():
     preset = PRESETS["fading"]
-    recording = film(Scene(preset), replace(SMALL, frames=30), noise_k=0.0)
+    recording = film(Scene(preset), Size(16, 13, 30, 16), noise_k=0.0)
     unit = [
         recording.thermal_range.to_unit(images.astype(np.float64)) for images in (recording.celsius, recording.clean)
     ]
@@ -166,7 +166,7 @@ def test_the_scene_knows_what_its_surfaces_are(metals):
 
 
 def test_tiles_are_finer_than_pixels_of_low_resolution_and_coarser_than_those_of_full():
-    lens = film(Scene(PRESETS["fine_texture"]), replace(SIZES["demo"], frames=2, points=10)).lens
+    lens = film(Scene(PRESETS["fine_texture"]), Size(SIZES["demo"].width, SIZES["demo"].height, 2, 10)).lens
     pixel_m = 2.2 / lens.fx  # at the middle of the path
     tiles = [pattern.tile_m for pattern in PRESETS["fine_texture"].start_k.values() if pattern.step == 3.0]
     assert len(tiles) == 6

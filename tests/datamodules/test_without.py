@@ -1,5 +1,7 @@
 """Scenes without one of their effects: only that is gone."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -55,7 +57,7 @@ def test_without_glass_what_lies_behind_is_seen():
 @pytest.mark.parametrize("effect", ["solar", "radiation", "convection"])
 def test_under_the_sky_only_one_way_of_heat_is_closed(effect):
     (preset,) = OUTDOOR.values()
-    less = without(preset, effect)
+    less = without(replace(preset, duration_s=3600.0), effect)  # as much of the record as shows what it is made of
     assert isinstance(less, OutdoorScene)
     before, after = preset.surfaces[0], less.preset.surfaces[0]
     assert (before.absorbs != after.absorbs) == (effect == "solar")

@@ -23,9 +23,9 @@ def light() -> Lighting:
     return Lighting(SHAPES, 1.0, 2.0)
 
 
-def in_a_box(points: np.ndarray, margin: float = 0.0) -> np.ndarray:
-    """Whether points [n, 3] lie in any box of the yard grown by ``margin``: three dot products with its edges."""
-    found = np.zeros(len(points), dtype=bool)
+def from_boxes(points: np.ndarray) -> np.ndarray:
+    """By how much a box of the yard has to grow on all sides to hold points [n, 3]: three dot products with its edges."""
+    found = np.full(len(points), np.inf)
     for shape in SHAPES[1:]:
         yaw, tilt = math.radians(shape.yaw_deg), math.radians(shape.tilt_deg)
         x = np.array([math.cos(yaw), math.sin(yaw), 0.0])
@@ -33,9 +33,8 @@ def in_a_box(points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         y = math.cos(tilt) * flat + math.sin(tilt) * np.array([0.0, 0.0, 1.0])
         offset = points - np.array(shape.center)
         axes = (x, y, np.cross(x, y))
-        found |= np.all(
-            [np.abs(offset @ axis) < 0.5 * side + margin for axis, side in zip(axes, shape.size, strict=True)], axis=0
-        )
+        off = [np.abs(offset @ axis) - 0.5 * side for axis, side in zip(axes, shape.size, strict=True)]
+        found = np.minimum(found, np.max(off, axis=0))
     return found
 
 
@@ -53,8 +52,9 @@ def test_shadows_are_those_of_marching_along_the_ray(hour):
     for i, start in enumerate(starts):
         points = start + steps[:, None] * sun.numpy()
         away = steps > max(0.1, 0.03 / rises[i])  # out of what its own box is grown by
-        hidden[i] = in_a_box(points, -0.02).any()
-        clear[i] = not in_a_box(points).any() and not in_a_box(points[away], 0.02).any()
+        off = from_boxes(points)
+        hidden[i] = off.min() < -0.02
+        clear[i] = off.min() >= 0.0 and (off[away] >= 0.02).all()
     grazed = ~hidden & ~clear  # by an edge that the march may just miss
     assert grazed.mean() < 0.05
     assert (lit[chosen] == ~hidden)[~grazed].all()

@@ -6,8 +6,8 @@ from functools import cache
 import torch
 
 from heatsplat.datamodules.synthetic import Synthetic
-from heatsplat.doctor.base import Material, material_of
-from heatsplat.doctor.examination import examine
+from heatsplat.doctor.base import Finding, Material, material_of
+from heatsplat.doctor.examination import CHECKS, examine
 
 
 @cache
@@ -21,6 +21,13 @@ def changed(material: Material, images: torch.Tensor, **others) -> Material:
     return replace(material, images=images, **others)
 
 
-def checks(material: Material) -> list[str]:
-    """Names of the checks that find something."""
-    return [finding.check for finding in examine(material)]
+def checks(material: Material, only: str | None = None) -> list[str]:
+    """Names of the checks that find something; ``only`` one of the examination's checks is asked, or all."""
+    findings = examine(material) if only is None else findings_of(material, only)
+    return [finding.check for finding in findings]
+
+
+def findings_of(material: Material, name: str) -> list[Finding]:
+    """What the check of this name finds, of those that an examination goes through."""
+    (check,) = (one for one in CHECKS if one.name == name)
+    return check.find(material)

@@ -4,18 +4,17 @@ from dataclasses import replace
 
 import pytest
 import torch
-from materials import changed, clean
+from materials import changed, clean, findings_of
 
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.doctor.base import material_of
 from heatsplat.doctor.checks import drift
-from heatsplat.doctor.examination import examine
 
 
 def test_drift_is_found_with_its_shutter_and_cooling_is_not_taken_for_it():
     count = len(clean().images)
     saw = 0.01 * (torch.arange(count, dtype=torch.float64) % 6)
-    found = [one for one in examine(changed(clean(), clean().images + saw[:, None, None])) if one.check == "drift"]
+    found = findings_of(changed(clean(), clean().images + saw[:, None, None]), "drift")
     assert found and clean().name(6) in found[0].frames
     assert not drift.find(clean("cooling"))
 

@@ -1,10 +1,8 @@
 """Blurred frames are found."""
 
 import torch
-from materials import changed, clean
+from materials import changed, clean, findings_of
 from torch.nn import functional
-
-from heatsplat.doctor.examination import examine
 
 
 def test_blurred_frames_are_found():
@@ -13,7 +11,7 @@ def test_blurred_frames_are_found():
         images[f] = functional.avg_pool2d(
             functional.pad(images[f][None, None], (4, 4, 0, 0), mode="replicate"), (1, 9), stride=1
         )
-    found = [one for one in examine(changed(clean(), images)) if one.check == "sharpness"]
+    found = findings_of(changed(clean(), images), "sharpness")
     assert found and {clean().name(4), clean().name(9)} <= set(found[0].frames)
 
 
@@ -29,5 +27,5 @@ def test_pixels_that_do_not_count_hide_no_blur():
     masks[:, 10:14, 10:14] = False
     cut = celsius.where(masks, 0.0)
     for material in (changed(clean(), dead, unit_k=1.0), changed(clean(), cut, unit_k=1.0, masks=masks)):
-        found = [one for one in examine(material) if one.check == "sharpness"]
+        found = findings_of(material, "sharpness")
         assert found and {clean().name(4), clean().name(9)} <= set(found[0].frames)

@@ -14,6 +14,7 @@ HALF, REACH = 4, 5  # pixels: half a patch, and how far a point is looked for ab
 STRUCTURE = 4.0  # a patch counts whose standard deviation is this many times the noise
 ALIKE = 0.75  # correlation from which two patches show the same
 MIN_POINTS = 12
+AT_ONCE = 8  # points that are looked for together
 # A frame is wrong where more than this share of its points lies further off: a part of them may lie behind glass, or hidden.
 SHARE, FAR_PX = 0.7, 2.5
 WRONG = 1 / 3  # share of such frames from which poses are wrong; panes and what moves take some
@@ -109,12 +110,21 @@ def _shifts(material: Material, one: int, other: int, points: Tensor) -> tuple[f
     base = second.project(world.reshape(-1, 3))[0].reshape(len(keep), -1, 2)
     steps = torch.arange(-REACH, REACH + 1, dtype=torch.float64)
     moves = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).reshape(-1, 2)
-    seen = _sampled(material.image(other), base[:, None] + moves[:, None])
-    alike = (unit(first)[:, None] * unit(seen)).sum(2)
-    best, where = alike.max(1)
+    best, where = _alike(unit(first), material.image(other), base, moves).max(1)
     found = best > ALIKE
     shift = torch.where(found, moves[where].norm(dim=1), float(REACH + 1))
     return float(shift.quantile(1.0 - SHARE)), float((shift <= FAR_PX).double().mean())
+
+
+def _alike(patterns: Tensor, image: Tensor, base: Tensor, moves: Tensor) -> Tensor:
+    """Correlation [n, m] of ``patterns`` [n, k], which have no mean and length 1, with what an image [H, W] shows at their places
+    ``base`` [n, k, 2] after each of ``moves`` [m, 2]; a few points at a time, which stay in the cache."""
+    alike = []
+    for pattern, around in zip(patterns.split(AT_ONCE), base.split(AT_ONCE), strict=True):
+        seen = _sampled(image, around[:, None] + moves[:, None])
+        seen -= seen.mean(2, keepdim=True)
+        alike.append((seen @ pattern[:, :, None])[..., 0] / seen.norm(dim=2).clamp_min(1e-12))
+    return torch.cat(alike)
 
 
 def _corner(patches: Tensor) -> Tensor:
@@ -134,7 +144,7 @@ def _inside(pixels: Tensor, depth: Tensor, camera: Camera, margin: float) -> Ten
 def _sampled(image: Tensor, pixels: Tensor) -> Tensor:
     """Values [...] of an image [H, W] at pixels [..., 2], bilinear."""
     extent = pixels.new_tensor([image.shape[1], image.shape[0]])
-    grid = (2.0 * pixels / extent - 1.0).reshape(1, 1, -1, 2)
+    grid = torch.addcmul(extent.new_tensor(-1.0), pixels, 2.0 / extent).reshape(1, 1, -1, 2)
     values = functional.grid_sample(image[None, None].nan_to_num(), grid, align_corners=False, padding_mode="border")
     return values.reshape(pixels.shape[:-1])
 
