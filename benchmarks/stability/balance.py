@@ -20,6 +20,7 @@ REFERENCE_K = 288.0
 STIFF = 60  # bodies that are integrated in steps
 AIR = (0.0, 20.0, -10.0, 5.0, 30.0, -20.0, 0.0, 10.0, -5.0)  # K above the reference at the samples
 START = 25.0
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 def _powers() -> dict[str, Tensor]:
@@ -81,8 +82,11 @@ def _stepped_ours(rate: Tensor, step: Tensor) -> Tensor:
     found = []
     for r, seconds in zip(rate, step.tolist(), strict=True):
         times = seconds * torch.arange(len(AIR), dtype=torch.float64)
-        climate = Climate(Drivers(times, REFERENCE_K, torch.tensor(AIR, dtype=torch.float64)))
-        surface = Surface(torch.full_like(r[None], START), r[None].log(), torch.zeros_like(r[None]))
+        climate = Climate(Drivers(times, REFERENCE_K, torch.tensor(AIR, dtype=torch.float64), up=UP))
+        # In the dark; with what the linear balance of the study of work and precision has, whose kernel this is.
+        surface = Surface(
+            torch.full_like(r[None], START), r[None].log(), torch.zeros_like(r[None]), normals=UP.to(r)[None]
+        )
         found.append(stepped_temperature(climate, surface, float(times[-1]))[0])
     return torch.stack(found)
 

@@ -99,10 +99,14 @@ def _seen_exact(radiance):
 
     band = Band()
     ends = mpmath.mpf(band.shortest_um), mpmath.mpf(band.longest_um)
-    start = mpmath.mpf(band.temperature(torch.tensor(float(radiance), dtype=torch.float64)).item())
-    found = mpmath.findroot(
-        lambda t: _sent_exact(t, *ends) / radiance - 1, (start, start * (1 + mpmath.mpf("1e-14"))), tol=1e-180
-    )
+    found = mpmath.mpf(band.temperature(torch.tensor(float(radiance), dtype=torch.float64)).item())
+    step = found
+    while abs(step) > 1e-70 * found:  # Newton's steps, each of which doubles the digits
+        sent, (low, high) = _sent_exact(found, *ends), _exponents(found, *ends)
+        front = mpmath.mpf(FIRST_RADIATION) * (found / mpmath.mpf(SECOND_RADIATION)) ** 4
+        slope = (4 * sent + front * (low**4 / mpmath.expm1(low) - high**4 / mpmath.expm1(high))) / found
+        step = (sent - radiance) / slope
+        found -= step
     return (found,)
 
 

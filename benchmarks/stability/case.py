@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -72,19 +73,26 @@ def _shares(name: str, count: int) -> Tensor:
 
 def truths(case: Case, inputs: dict[str, Tensor]) -> tuple[list[Sequence], list[Sequence] | None]:
     """Exact outputs of every draw and, where asked for, their slopes: lists [n] of tuples of mpmath numbers."""
+    return _truths(case.exact, case.by, tuple(inputs), tuple(zip(*(x.tolist() for x in inputs.values()), strict=True)))
+
+
+@lru_cache  # a kernel has the truth of the form that it stands for
+def _truths(
+    exact: Callable[..., Sequence], by: str | None, names: tuple[str, ...], rows: tuple[tuple[float, ...], ...]
+):
     import mpmath
 
     values, slopes = [], []
     with mpmath.workdps(DIGITS):
-        for row in zip(*(x.tolist() for x in inputs.values()), strict=True):
-            numbers = dict(zip(inputs, map(mpmath.mpf, row), strict=True))
-            values.append(tuple(case.exact(**numbers)))
-            if case.by is not None:
-                at = numbers[case.by]
+        for row in rows:
+            numbers = dict(zip(names, map(mpmath.mpf, row), strict=True))
+            values.append(tuple(exact(**numbers)))
+            if by is not None:
+                at = numbers[by]
                 step = mpmath.mpf(RELATIVE_STEP) * (abs(at) if at != 0 else 1)
-                after, before = (case.exact(**{**numbers, case.by: at + sign * step}) for sign in (1, -1))
+                after, before = (exact(**{**numbers, by: at + sign * step}) for sign in (1, -1))
                 slopes.append(tuple((a - b) / (2 * step) for a, b in zip(after, before, strict=True)))
-    return values, slopes if case.by is not None else None
+    return values, slopes if by is not None else None
 
 
 def evaluated(case: Case, form: Forms, inputs: dict[str, Tensor], dtype: torch.dtype, constants: Sequence[str]):

@@ -90,7 +90,9 @@ def _ssim_exact(index, change):
         for _ in range(2):  # rows, then columns
             image = [
                 [
-                    sum(taps[j] * row[i + j - WINDOW // 2] for j in range(WINDOW) if 0 <= i + j - WINDOW // 2 < SIDE)
+                    mpmath.fdot(
+                        (taps[j], row[i + j - WINDOW // 2]) for j in range(WINDOW) if 0 <= i + j - WINDOW // 2 < SIDE
+                    )
                     for row in image
                 ]
                 for i in range(SIDE)

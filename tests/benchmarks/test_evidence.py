@@ -84,7 +84,7 @@ def test_verdicts_are_kept_and_drawn_scenes_have_tables_of_their_own(tmp_path, m
 
     def data(**options):
         asked.append(options["scene"])
-        return Synthetic(**options)
+        return Synthetic(**options, frames=4)
 
     drawn = {"looked at": [4, 1], "unseen": [9, 1]}  # scenes that are filmed in a second
     text = run(tmp_path, data, ["static"], seeds=[0], drawn=drawn, jobs=1)

@@ -44,7 +44,7 @@ def test_the_printed_form_is_worse_in_every_case(rows, family):
 
 
 def test_a_word_is_a_list_of_one_and_a_family_that_there_is_not_is_named(tmp_path):
-    assert run(tmp_path, families="images").count("\n## ") == 1
+    assert run(tmp_path, families="sensing").count("\n## ") == 1
     with pytest.raises(SceneError, match="each of study.families must be one of closed_form, .*got 'nope'"):
         run(tmp_path, families=["nope"])
 

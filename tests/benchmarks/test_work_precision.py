@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from running import compose_run
 
@@ -40,8 +41,9 @@ def test_ours_is_exact_and_the_printed_formula_loses_its_phases():
 
 
 def test_ours_follows_the_weather_with_and_without_fourth_powers():
-    steps = {"thin": [600.0], "weather_linear": [600.0], "weather_full": [200.0, 100.0]}
-    rows = measured(only=list(steps), solvers=["ETD2"], steps=steps, types=["float32"], gaussians=16)
+    rows = measured(only=["thin", "weather_linear"], solvers=[], types=["float32"], gaussians=16)
+    steps = {"weather_full": [200.0, 100.0]}
+    rows += measured(only=list(steps), solvers=["ETD2"], steps=steps, types=["float32"], gaussians=16)
     bounds = {"thin": 1e-3, "weather_linear": 1e-4, "weather_full": 2e-2}
     for problem, bound in bounds.items():
         assert worst(rows, problem, "balance, time-stepped kernel", "float32")[0] < bound
@@ -68,7 +70,8 @@ def test_solvers_have_their_order(problem, solver, steps, order):
         assert all(r.us_alone == pytest.approx(2.5 * r.us) for r in rows if r.solver == solver)
 
 
-def test_exponential_steps_are_exact_where_they_should_be():
+def test_exponential_steps_are_exact_where_they_should_be(monkeypatch):
+    monkeypatch.setattr(work_precision, "_forms", lambda *_: [])  # ours has a kernel for each type and balance
     rows = measured(only=["cooling"], solvers=["exponential Euler"], steps={"cooling": [600.0]})
     rows += measured(only=["weather_linear"], solvers=["ETD2"], types=["float64"], steps={"weather_linear": [600.0]})
     assert worst(rows, "cooling", "exponential Euler")[0] < 1e-11
@@ -149,6 +152,7 @@ def test_the_study_runs_from_its_configuration(tmp_path):
 def test_the_page_is_written_only_with_the_settings_that_it_states(tmp_path, monkeypatch):
     rows = measured(only=["cooling"], solvers=[], types=["float32"])
     monkeypatch.setattr(work_precision, "measurements", lambda **_: (rows, {"cooling": "Cooling"}))
+    monkeypatch.setattr(report, "picture", lambda *_: Figure(figsize=(1, 1)))  # they are looked at above
     usual = compose(["study=work_precision"], "study")["study"]
     usual = {key: value for key, value in usual.items() if key not in ("_target_", "document", "pictures")}
     page = tmp_path / "page.md"
