@@ -77,13 +77,18 @@ def succeeds(arguments: Sequence[str], cwd: Path = ROOT, code: int = 0, **enviro
     return done.output
 
 
-def _forked(timeout: float, target: Callable, *arguments: Any) -> int | None:
-    """The exit code of a fork that runs ``target``; None where it is killed after ``timeout`` seconds."""
+def forking() -> multiprocessing.context.ForkServerContext:
+    """Starts processes as forks of the server, which runs from here on."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(LIBRARIES))
     with mock.patch.dict(os.environ, PYTHONPATH=str(SOURCES)):  # of this checkout, wherever another is installed
         forkserver.ensure_running()
-    process = context.Process(target=target, args=arguments)
+    return context
+
+
+def _forked(timeout: float, target: Callable, *arguments: Any) -> int | None:
+    """The exit code of a fork that runs ``target``; None where it is killed after ``timeout`` seconds."""
+    process = forking().Process(target=target, args=arguments)
     process.start()
     process.join(timeout)
     if process.is_alive():

@@ -21,7 +21,6 @@ if WORKERS:  # before torch is imported, which reads it once
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job: what it starts would not hear Ctrl-C
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-FILMING = {"datamodules"}  # folders with tests of filming itself
 # Files that take longest, begun first: side by side, no process is left with one of them while the others have none.
 LONGEST = (
     "viewer/test_page.py",
@@ -72,6 +71,7 @@ def pytest_xdist_auto_num_workers(config):
 
 def pytest_collection_finish():
     gc.freeze()  # they are not looked through again
+    gc.set_threshold(5000, 20, 20)  # in place of 700, 10, 10: configurations come and go by the thousand objects
     gc.enable()
 
 
@@ -117,11 +117,8 @@ def films(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def filmed_once(request, films):
-    """Runs on the same recording share it: filming takes half of a tiny run. Tests of filming itself film."""
-    if request.path.parent.name in FILMING:
-        yield
-        return
+def filmed_once(films):
+    """Scenes of the same recording share it: filming takes half of a tiny run. Tests of filming itself call ``film``."""
     from heatsplat.datamodules.synthetic import Synthetic
 
     with pytest.MonkeyPatch.context() as patch:

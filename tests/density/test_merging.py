@@ -22,7 +22,10 @@ HALF = 0.3  # of a semi-axis: how far the halves of a split Gaussian are from it
 
 def untrained(tmp_path, *overrides):
     """The module of a run before its first step, with its scene."""
-    run = begin(compose([*TINY, "data.scene=cooling", "max_steps=10", *overrides]), tmp_path)
+    run = begin(
+        compose([*TINY, "data.scene=cooling", "data.downscale=2", "data.frames=9", "max_steps=10", *overrides]),
+        tmp_path,
+    )
     run.data.setup("fit")
     run.module.attach(run.data.scene)
     return run.module
@@ -48,6 +51,11 @@ def module(tmp_path_factory):
     return halved(untrained(tmp_path_factory.mktemp("run"), "method=etgs"))
 
 
+@pytest.fixture(scope="module")
+def level(module):
+    return next(FlatMerging().levels(module, [0.05]))
+
+
 def lost_c(module, splats):
     """What other splats change of all training images, °C: root mean square, and the quantile that is reported beside it."""
     before = [module.predict_all(frame)["clean"] for frame in module.scene.train.frames]
@@ -70,23 +78,21 @@ def test_what_is_lost_is_measured_and_kept(module):
     assert len(module.splats) == before
 
 
-def test_the_same_gaussians_are_merged_every_time(module):
-    one, other = (next(FlatMerging().levels(module, [0.05])) for _ in range(2))
-    assert torch.equal(one.origin, other.origin)
-    assert all(torch.equal(one.splats[name], other.splats[name]) for name in one.splats.names)
+def test_the_same_gaussians_are_merged_every_time(module, level):
+    again = next(FlatMerging().levels(module, [0.05]))
+    assert torch.equal(again.origin, level.origin)
+    assert all(torch.equal(again.splats[name], level.splats[name]) for name in level.splats.names)
 
 
-def test_a_few_pairs_and_views_at_a_time_find_the_same(module, monkeypatch):
-    whole = next(FlatMerging().levels(module, [0.05]))
+def test_a_few_pairs_and_views_at_a_time_find_the_same(module, level, monkeypatch):
     monkeypatch.setattr(merging, "PAIRS", 97)
     monkeypatch.setattr(merging, "VIEWS", 3)
     few = next(FlatMerging().levels(module, [0.05]))
-    assert torch.equal(few.origin, whole.origin)
-    assert all(torch.equal(few.splats[name], whole.splats[name]) for name in whole.splats.names)
+    assert torch.equal(few.origin, level.origin)
+    assert all(torch.equal(few.splats[name], level.splats[name]) for name in level.splats.names)
 
 
-def test_what_stays_keeps_its_moments(module):
-    level = next(FlatMerging().levels(module, [0.05]))
+def test_what_stays_keeps_its_moments(module, level):
     splats = Splats({name: module.splats[name].detach() for name in module.splats.names})
     adam = torch.optim.Adam([{"params": [splats[name]], "name": name} for name in splats.names], lr=0.0)
     sum(splats[name].square().sum() for name in splats.names).backward()

@@ -18,7 +18,8 @@ EFFECTS = [one.EFFECT for one in (relaxation, harmonic_source, fixed_pattern, vi
 
 
 def inspected(name: str, frames: int) -> Inspection:
-    return Inspection(Synthetic(scene=name, size="tiny", frames=frames).scene, EFFECTS)
+    scene = Synthetic(scene=name, size="tiny", frames=frames).scene
+    return Inspection(replace(scene, points=scene.points[::2], point_colors=scene.point_colors[::2]), EFFECTS)
 
 
 @pytest.fixture(scope="module")

@@ -283,11 +283,11 @@ CASES = {
         ("source_gains",),
     ),
     "solar": Case(
-        ("relaxation", "convection", "frame_offset"),
-        lambda: ByHand(air(wind=True), chain={"frame_offset": FrameOffset()}),
+        ("relaxation", "radiation", "frame_offset"),
+        lambda: ByHand(air(sky="auto"), chain={"frame_offset": FrameOffset()}),
         ("raw_sun", "normals"),
     ),
-    "semi_infinite": Case(("relaxation", "convection"), lambda: ByHand(air(wind=True)), ()),
+    "semi_infinite": Case(("relaxation", "solar"), lambda: ByHand(air(sun=True)), ()),
     "radiation": Case(
         ("relaxation", "solar", "reflection"),
         lambda: ByHand(open_air(sun=True), {"reflection": Reflection(degree=2)}),
@@ -299,8 +299,8 @@ CASES = {
         ("raw_wind", "mean_wind"),
     ),
     "shadows": Case(
-        ("relaxation", "solar", "albedo"),
-        lambda: ByHand(air(sun=True, albedo=0.2)),
+        ("relaxation", "solar"),
+        lambda: ByHand(air(sun=True)),
         ("sun_seen",),
     ),
     "sky_view": Case(

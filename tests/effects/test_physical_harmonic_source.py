@@ -13,7 +13,9 @@ from heatsplat.physics.common_course import MOMENTS
 
 
 def inspected(name, **recorded):
-    return Inspection(Synthetic(scene=name, **recorded).scene, [relaxation.EFFECT, harmonic_source.EFFECT])
+    scene = Synthetic(scene=name, **recorded).scene
+    scene = replace(scene, points=scene.points[::2], point_colors=scene.point_colors[::2])
+    return Inspection(scene, [relaxation.EFFECT, harmonic_source.EFFECT])
 
 
 @pytest.fixture(scope="module")

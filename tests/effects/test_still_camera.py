@@ -31,7 +31,7 @@ def recorded(cools, drifts, seed):
 
 @pytest.mark.parametrize("drifts", [False, True])
 @pytest.mark.parametrize("cools", [False, True])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_cooling_and_drift_before_a_still_camera_are_told_apart(cools, drifts, seed):
     verdicts = decide(scene(recorded(cools, drifts, seed)))
     assert verdicts["relaxation"].on == cools, verdicts["relaxation"]

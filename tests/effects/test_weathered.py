@@ -1,6 +1,7 @@
 """Balances of heat with and without sun, sky and wind, on points whose heat is known."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import pytest
@@ -30,6 +31,12 @@ from heatsplat.physics.wetness import FILM_MM, rained_on, wetted
 POINTS, FRAMES, STEP_S = 60, 48, 120.0
 
 
+@cache
+def recorded_at(time_s):
+    """What the weather of all recordings here is at a moment, their clouds and rain aside."""
+    return make_weather().at(time_s)
+
+
 def recorded(without="", depth=0.0, lit=None, clouds=None, rain=None, **seen):
     """Points under a weather, integrated in small steps; noise of 0.1 K.
 
@@ -56,7 +63,7 @@ def recorded(without="", depth=0.0, lit=None, clouds=None, rain=None, **seen):
     core = temperature
     for time in times.tolist():
         while now < time:
-            here = weather.at(now)
+            here = recorded_at(now)
             air_k = torch.tensor(here.air_c + KELVIN_AT_0_C, dtype=torch.float64)
             moist = torch.tensor(here.humidity_percent, dtype=torch.float64)
             at = int((weather.times_s - now).abs().argmin())

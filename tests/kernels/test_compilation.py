@@ -1,12 +1,12 @@
 """The cache of compiled kernels: damaged, full or unwritable, it costs time and not the run."""
 
 import errno
-import multiprocessing
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
+from commands import forking
 from numba.core import caching
 
 from heatsplat.kernels import compilation
@@ -113,7 +113,7 @@ def _double_at_once(folder: str, barrier) -> None:
 
 
 def test_processes_may_fill_the_cache_at_once(folder):
-    context = multiprocessing.get_context("spawn")
+    context = forking()
     barrier = context.Barrier(2)
     processes = [context.Process(target=_double_at_once, args=(numba.config.CACHE_DIR, barrier)) for _ in range(2)]
     for process in processes:

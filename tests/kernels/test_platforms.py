@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import succeeds
 
 SOURCE = Path(__file__).resolve().parents[2] / "src"
 
@@ -15,6 +16,7 @@ SOURCE = Path(__file__).resolve().parents[2] / "src"
 STEP = """
 import sys
 import numba, numpy as np, torch
+numba.config.THREADING_LAYER = sys.argv[2] if sys.argv[2:] else numba.config.THREADING_LAYER
 from heatsplat.losses.compose import LossInputs
 from heatsplat.losses.photometric import Photometric
 from heatsplat.physics.fused import visible_temperature
@@ -42,6 +44,13 @@ numbers = [tensor.numpy() for tensor in step()]
 SAVE = "np.savez(sys.argv[1], *numbers); print(numba.threading_layer())\n"
 
 
+def forked(folder: Path, script: str, *arguments: str) -> str:
+    """What a script prints in a fork of a process that has loaded the libraries and started no thread."""
+    file = folder / "script.py"
+    file.write_text(script)
+    return succeeds([str(file), *arguments], SOURCE.parent).strip()
+
+
 def run(script: str, *arguments: str, **variables: str) -> str:
     """What a script prints in a fresh interpreter with further environment variables."""
     environment = os.environ | {"PYTHONPATH": str(SOURCE)} | variables
@@ -56,7 +65,8 @@ LOADER = """
 from torch.utils.data import DataLoader
 from heatsplat.datamodules.synthetic import Synthetic
 
-loader = DataLoader(Synthetic(scene="static", size="tiny").scene.train, batch_size=None, num_workers=2)
+views = Synthetic(scene="static", size="tiny").scene.train
+loader = DataLoader(views, batch_size=None, num_workers=2, multiprocessing_context="fork")
 views = [float(view.thermal.mean()) for view in loader]
 again = [tensor.numpy() for tensor in step()]
 assert all(np.array_equal(a, b) for a, b in zip(numbers, again, strict=True))
@@ -70,9 +80,9 @@ def numbers(tmp_path_factory) -> list[np.ndarray]:
 
     A forked child of OpenMP threads dies in its first parallel region; views are decoded without any kernel.
     """
-    path = tmp_path_factory.mktemp("step") / "here.npz"
-    run(STEP + SAVE + LOADER, str(path))
-    return list(np.load(path).values())
+    folder = tmp_path_factory.mktemp("step")
+    forked(folder, STEP + SAVE + LOADER, str(folder / "here.npz"))
+    return list(np.load(folder / "here.npz").values())
 
 
 def test_data_loaders_may_fork_after_kernels_have_run(numbers):
@@ -82,7 +92,7 @@ def test_data_loaders_may_fork_after_kernels_have_run(numbers):
 def test_the_fallback_threading_layer_gives_the_same_bits(numbers, tmp_path):
     # OpenMP is not everywhere (macOS, some containers); workqueue comes with Numba.
     path = tmp_path / "workqueue.npz"
-    assert run(STEP + SAVE, str(path), NUMBA_THREADING_LAYER="workqueue") == "workqueue"
+    assert forked(tmp_path, STEP + SAVE, str(path), "workqueue") == "workqueue"
     for found, expected in zip(np.load(path).values(), numbers, strict=True):
         assert np.array_equal(found, expected)
 

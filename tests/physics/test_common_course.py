@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import solve_ivp
+from scipy.integrate import odeint, solve_ivp
 
 from heatsplat.physics.common_course import BEND, RATES, common_course, least_squares, response_table
 
@@ -24,16 +24,23 @@ def walls(count=60, layers=12):
         flow, loss, gain = 10 ** generator.uniform(2, 3), 10 ** generator.uniform(-0.3, 0.5), generator.uniform(0.2, 1)
         start = generator.uniform(0, 0.3)
 
-        def rates(at, x, flow=flow, loss=loss, gain=gain):
-            step = np.diff(x, prepend=x[:1], append=x[-1:]) * flow
-            rise = step[1:] - step[:-1]
-            rise[0] += layers * 3 * (gain * power(at) - loss * x[0])
-            return rise
+        # Heat flows between neighbouring layers; the first is heated, and loses heat.
+        neighbours = np.eye(layers, k=1) + np.eye(layers, k=-1)
+        slopes = flow * (neighbours - np.diag(neighbours.sum(0)))
+        slopes[0, 0] -= layers * 3 * loss
+        heated = layers * 3 * gain * np.eye(layers)[0]
 
-        solved = solve_ivp(
-            rates, (0, 1), np.full(layers, start), "LSODA", SPANS.numpy(), rtol=1e-7, atol=1e-9, max_step=0.01
-        )
-        found.append(solved.y[0])
+        def rates(at, x, slopes=slopes, heated=heated):
+            return slopes @ x + heated * power(at)
+
+        options = {
+            "tfirst": True,
+            "Dfun": lambda at, x, slopes=slopes: slopes,
+            "rtol": 1e-7,
+            "atol": 1e-9,
+            "hmax": 0.01,
+        }
+        found.append(odeint(rates, np.full(layers, start), SPANS.numpy(), **options)[:, 0])
     return torch.from_numpy(np.stack(found))
 
 

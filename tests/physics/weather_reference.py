@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import torch
-from scipy.integrate import solve_ivp
+from scipy.integrate import odeint
 
 from heatsplat.physics.sky import sky_temperature_k
 from heatsplat.physics.surfaces import Drivers, Surface, power_excess
@@ -49,7 +49,7 @@ def drivers(days: float = 2.0, step_s: float = 600.0, wind: bool = True) -> Driv
 
 
 def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch.Tensor | None = None) -> torch.Tensor:
-    """Temperatures x [n, F] of surfaces with normals, and what is behind them, at moments [F] by Radau, one interval of the
+    """Temperatures x [n, F] of surfaces with normals, and what is behind them, at moments [F] by LSODA, one interval of the
     record at a time.
 
     Args:
@@ -82,12 +82,17 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
     behind = surface.start if surface.core is None else surface.core.start
     state = np.concatenate((surface.start.numpy(), behind.numpy()))
     found = {ends[0]: state[:count]}
+    steep = None if mean is None else (1 + mean / reference) ** 3
+    still = None if mean is None else share * (radiated(mean) - steep * mean)
+    jacobian = np.zeros((2 * count, 2 * count))
+    own, across = np.arange(count), np.arange(count, 2 * count)
+    jacobian[own, across], jacobian[across, own], jacobian[across, across] = rate * kappa, mu, -mu
     for begin, end in zip(ends[:-1], ends[1:], strict=True):
         k = min(np.searchsorted(times, begin, side="right") - 1, len(times) - 2)
+        span = times[k + 1] - times[k]
 
-        def now(series, t, k=k):
-            part = (t - times[k]) / (times[k + 1] - times[k])
-            return series[k] * (1 - part) + series[k + 1] * part
+        def now(series, t, k=k, span=span):
+            return series[k] + (t - times[k]) / span * (series[k + 1] - series[k])
 
         def slope(t, state, now=now):
             x, y = state[:count], state[count:]
@@ -95,23 +100,17 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
             if mean is None:
                 taken = f + (1 - share) * (1 + wind * b) * now(wetted, t) * (a - x) - share * radiated(x)
             else:
-                steep = (1 + mean / reference) ** 3
                 convected = (1 + wind * calm) * (a - x) + wind * (now(anomaly * air, t) - calm * a - (b - calm) * mean)
-                taken = f + (1 - share) * convected - share * (radiated(mean) + steep * (x - mean))
+                taken = f + (1 - share) * convected - share * steep * x - still
             return np.concatenate((rate * taken, mu * (x - y)))
 
-        def jacobian(t, state, now=now):
+        def slopes(t, state, now=now):
             gusts, about_x = (now(anomaly, t), state[:count]) if mean is None else (calm, mean)
-            own = (
-                (1 - share) * (1 + wind * gusts) * now(wetted, t)
-                + share * (1 + about_x / reference) ** 3
-                + kappa
-                + leak
-            )
-            return np.block([[np.diag(-rate * own), np.diag(rate * kappa)], [np.diag(mu), np.diag(-mu)]])
+            exchange = (1 - share) * (1 + wind * gusts) * now(wetted, t) + share * (1 + about_x / reference) ** 3
+            jacobian[own, own] = -rate * (exchange + kappa + leak)
+            return jacobian
 
-        step = (end - begin) / 4
-        options = {"rtol": 1e-7, "atol": 1e-6, "jac": jacobian, "first_step": step}
-        state = solve_ivp(slope, (begin, end), state, "Radau", **options).y[:, -1]
+        options = {"tfirst": True, "Dfun": slopes, "rtol": 1e-8, "atol": 1e-8, "mxstep": 100_000}
+        state = odeint(slope, state, (begin, end), **options)[-1]
         found[end] = state[:count]
     return torch.tensor(np.stack([found[t] for t in moments.numpy()], axis=1))

@@ -14,8 +14,10 @@ TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
 
 def left_out(path: Path) -> set[str]:
     """Words for why tests of a file may not run: "slow", "gpu", or "needs" something that is missing."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    found, text = set(), path.read_text(encoding="utf-8")
+    if not re.search(r"\b(slow|gpu|skipif|importorskip)\b", text):
+        return found
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Attribute):
             mark = isinstance(node.value, ast.Attribute) and node.value.attr == "mark"
             if mark and node.attr in ("slow", "gpu"):

@@ -22,9 +22,14 @@ SHORT = (
     "method=etgs",
     *TINY,
     "data.scene=cooling",
+    "data.downscale=2",
+    "callbacks.costs=null",
+    "trainer.limit_val_batches=0",
+    "logger=none",
     "max_steps=20",
     "merge=flat",
     "merge.tolerance_c=0.2",
+    "merge.views=4",
     "test=false",
 )
 
@@ -52,7 +57,7 @@ def test_a_run_ends_with_its_gaussians_merged_and_says_so(merged):
 def test_levels_are_checkpoints_and_splats_for_viewers(merged, tmp_path):
     folder, _ = merged
     trained = load(folder / "checkpoints" / "step_000020.ckpt")
-    write_levels(trained, FlatMerging(), [0.1, 0.3], tmp_path, partial(write_file, trained.module, Ply()))
+    write_levels(trained, FlatMerging(views=4), [0.1, 0.3], tmp_path, partial(write_file, trained.module, Ply()))
     told = json.loads((tmp_path / "levels.json").read_text())
     frame = trained.scene.train.frames[0]
     for number, level in enumerate(told):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from running import compose_run
 
@@ -43,6 +44,12 @@ def made(
     results.put("cost", "train_seconds", seconds)
     results.put("cost", "peak_memory_mb", 700.0)
     results.write(folder / METRICS_FILE)
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Drawing takes a second; the test of tables, pictures and the page looks at it."""
+    monkeypatch.setattr(frontier, "picture", lambda recipes: Figure(figsize=(1, 1)))
 
 
 @pytest.fixture
@@ -237,7 +244,7 @@ def test_a_knob_that_is_null_is_null_for_its_run():
         (".hydra/overrides.yaml", "[", "while parsing"),
     ],
 )
-def test_a_run_that_cannot_be_read_is_left_out_with_a_warning(runs, tmp_path, caplog, name, content, why):
+def test_a_run_that_cannot_be_read_is_left_out_with_a_warning(runs, tmp_path, caplog, no_pictures, name, content, why):
     (runs / "sweep" / "b" / name).write_text(content)
     with caplog.at_level("WARNING", logger="heatsplat"):
         recipes = run(tmp_path / "out", str(runs), **LEVELS)
@@ -255,7 +262,7 @@ def test_where_no_run_can_be_read_the_folder_and_the_remedy_are_named(tmp_path):
         run(tmp_path / "out", str(tmp_path), **LEVELS)
 
 
-def test_levels_are_those_asked_for(runs, tmp_path):
+def test_levels_are_those_asked_for(runs, tmp_path, no_pictures):
     run(tmp_path / "out", str(runs), psnr_levels_db=[29, 21.5], mae_levels_c=[])
     text = (tmp_path / "out" / "frontier.md").read_text()
     assert "| seconds to | 21.5 dB | 29 dB |\n" in text
@@ -268,7 +275,7 @@ def test_levels_that_are_none_are_refused(runs, tmp_path, name, levels):
         run(tmp_path / "out", str(runs), **LEVELS | {name: levels})
 
 
-def test_the_study_trains_what_it_is_asked_for_and_nothing_twice(tmp_path, monkeypatch):
+def test_the_study_trains_what_it_is_asked_for_and_nothing_twice(tmp_path, monkeypatch, no_pictures):
     asked = []
 
     def trained(place, train, overrides, study):

@@ -413,13 +413,14 @@ SHORT = (
     "trainer.limit_test_batches=2", "callbacks.images=null", "callbacks.probes=null", "callbacks.costs.fps_repeats=1",
     "callbacks.viewer=null", "doctor=false", *NO_PICTURES,
 )  # fmt: skip
+UNLOGGED = ("callbacks.dashboard=null", "callbacks.statistics=null", "callbacks.attributes=null", "logger=none")
 
 
 def test_one_command_trains_a_table_and_prints_ours_beside_the_papers(tmp_path, monkeypatch, caplog):
     """In this process, to save its start; the slow tests give the command as a user does."""
     root = write_fake("rhd", tmp_path / "RHD", "cooling_dumbbels")
     quiet = ("hydra/job_logging=none", "hydra/hydra_logging=none")  # as this process has it
-    overrides = ("experiment=table_etgs_7", f"data.root={root}", "table.methods=[etgs]", *SHORT, *quiet)
+    overrides = ("experiment=table_etgs_7", f"data.root={root}", "table.methods=[etgs]", *SHORT, *UNLOGGED, *quiet)
     monkeypatch.setattr(sys, "argv", ["train.py", *overrides, f"hydra.sweep.dir={tmp_path}/sweep"])
     with caplog.at_level("INFO", logger="heatsplat"):
         cli.train()
@@ -443,7 +444,7 @@ def test_one_command_trains_on_the_other_scenes_first_and_goes_on_when_that_fail
     weather = (root / "S3" / "weather.csv").rename(tmp_path / "weather.csv")
     quiet = ("hydra/job_logging=none", "hydra/hydra_logging=none", "thermal.width=16", f"data.root={root}")
     asked = ("table.methods=[thermogs]", "table.scenes=[thermo_s2]", "table.settings=[cross_scene]")
-    overrides = ["experiment=table_thermogs_2", *asked, *SHORT, *quiet, f"hydra.sweep.dir={tmp_path}/sweep"]
+    overrides = ["experiment=table_thermogs_2", *asked, *SHORT, *UNLOGGED, *quiet, f"hydra.sweep.dir={tmp_path}/sweep"]
     comparison = tmp_path / "sweep" / "comparison.md"
 
     def go(*more: str) -> str:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from matplotlib.figure import Figure
 
 from heatsplat import cli
 from heatsplat.composition import compose
@@ -46,6 +47,12 @@ def made(
 
 
 @pytest.fixture
+def no_pictures(monkeypatch):
+    """Drawing takes half a second; the tests of the standard schedule and of several panels draw."""
+    monkeypatch.setattr(time_to_accuracy, "picture", lambda panels, clock: Figure(figsize=(1, 1)))
+
+
+@pytest.fixture
 def runs(tmp_path) -> Path:
     """Two seeds: a reference of 80 s, standard runs of 10 and 40 s, and a recipe of 20 s."""
     for seed, gain in ((0, 0.0), (1, 1.0)):
@@ -68,7 +75,7 @@ def by_recipe(folder: Path, seed: str = "0") -> dict[str, dict[str, str]]:
     return {row["recipe"]: row for row in read(folder / "time_to_accuracy.csv") if row["seed"] == seed}
 
 
-def test_recipes_are_measured_by_the_reference_of_their_seed(runs, tmp_path):
+def test_recipes_are_measured_by_the_reference_of_their_seed(runs, tmp_path, no_pictures):
     run(tmp_path / "out", str(runs), REFERENCE, RECIPES)
     for seed, seconds in (("0", 20.0), ("1", 24.0)):
         row = by_recipe(tmp_path / "out", seed)["quick"]
@@ -86,7 +93,7 @@ def test_recipes_are_measured_by_the_reference_of_their_seed(runs, tmp_path):
     assert short["end_psnr"] == short["way_psnr"] == ""  # never as good
 
 
-def test_a_recipe_that_is_nothing_is_left_out(runs, tmp_path):
+def test_a_recipe_that_is_nothing_is_left_out(runs, tmp_path, no_pictures):
     run(tmp_path / "out", str(runs), REFERENCE, RECIPES | {"draft": None})
     assert "quick" in by_recipe(tmp_path / "out") and "draft" not in by_recipe(tmp_path / "out")
 
@@ -109,7 +116,7 @@ def test_the_standard_schedule_in_the_same_time_lies_between_its_runs(runs, tmp_
         assert panel.standard_in(Outcome("quick", "0", 1, seconds, scores, 1.0, {"psnr": [], "mae_c": []})) is None
 
 
-def test_processor_seconds_may_take_the_place_of_those_of_the_clock(runs, tmp_path, caplog):
+def test_processor_seconds_may_take_the_place_of_those_of_the_clock(runs, tmp_path, caplog, no_pictures):
     made(runs / "busy", ["preset=busy", "seed=0"], 200, 900.0, 41.0, [(900, 41.0)], cpu=0.01)
     (panel,) = run(tmp_path / "out", str(runs), REFERENCE, RECIPES, clock="cpu_seconds")
     row = by_recipe(tmp_path / "out")["preset=busy"]
@@ -137,7 +144,7 @@ def test_methods_and_scenes_have_panels_and_references_of_their_own(runs, tmp_pa
     assert found.standard_in(found.outcomes[1]) is None  # one length says nothing of others
 
 
-def test_a_scene_without_temperatures_is_measured_by_psnr_alone(tmp_path):
+def test_a_scene_without_temperatures_is_measured_by_psnr_alone(tmp_path, no_pictures):
     for place, steps, psnr in (("a", 800, 40.0), ("b", 200, 39.9)):
         overrides = ["max_steps=800"] if steps == 800 else ["preset=fast"]
         made(tmp_path / place, overrides, steps, steps / 10, psnr)
@@ -172,7 +179,7 @@ def test_a_word_or_number_is_a_list_of_one():
     ]
 
 
-def test_missing_runs_are_trained_and_finished_ones_are_not(runs, tmp_path, monkeypatch):
+def test_missing_runs_are_trained_and_finished_ones_are_not(runs, tmp_path, monkeypatch, no_pictures):
     asked = []
 
     def train(place: Path, train: str | None, overrides: list[str], study: Path) -> None:
@@ -201,7 +208,7 @@ def test_missing_runs_are_trained_and_finished_ones_are_not(runs, tmp_path, monk
     assert (None, 300, "2") in names and ("other", 200, "0") in names and ("quick", 200, "2") in names
 
 
-def test_what_a_case_says_beside_its_scene_makes_a_panel_and_no_other_recipe(tmp_path, monkeypatch):
+def test_what_a_case_says_beside_its_scene_makes_a_panel_and_no_other_recipe(tmp_path, monkeypatch, no_pictures):
     def train(place: Path, train: str | None, overrides: list[str], study: Path) -> None:
         own = [text for text in overrides if not text.startswith(("method=", "data.scene="))]
         steps = 800 if "max_steps=800" in overrides else 200

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from running import TINY, run
+from running import BARE, run
 
 from heatsplat.contracts import Camera
 from heatsplat.datamodules.synthetic_scene.presets import droplets
@@ -35,9 +35,7 @@ def test_an_unknown_way_to_clip_is_refused():
 
 
 def test_a_run_finds_the_extinction_of_the_fog(tmp_path):
-    module, _ = run(
-        tmp_path, *TINY, "method=through_air", "data.scene=fog", "max_steps=600", "sensor=none", "test=false"
-    )
+    module, _ = run(tmp_path, *BARE, "method=through_air", "data.scene=fog", "max_steps=600", "sensor=none")
     extinction = module.thermal.air.extinction().item()
     assert extinction == pytest.approx(droplets(2.0), rel=0.25)
     points, _ = module.scene.probes[:, :3], module.scene.probes

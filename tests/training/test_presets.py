@@ -41,7 +41,7 @@ def kind(settings: dict) -> str:
 def test_a_method_keeps_what_is_its_own_with_a_preset(method, preset):
     """Its schedule is shares of the preset's steps, and none ends beyond them; presets take turns."""
     plain, own = compose([f"method={method}"]), (Path(CONF) / "method" / f"{method}.yaml").read_text()
-    config = composed(f"method={method}", f"preset={preset}", *BARE)
+    config = composed(f"method={method}", f"preset={preset}", "data.size=tiny")
     if "stop" not in config["density"]:  # nothing grows: a field has no Gaussians
         return
     steps, stop = config["max_steps"], config["density"]["stop"]
@@ -57,7 +57,7 @@ def test_a_method_keeps_what_is_its_own_with_a_preset(method, preset):
 
 
 def test_presets_are_ordered():
-    found = [composed("method=etgs", f"preset={preset}", *BARE) for preset in PRESETS]
+    found = [composed("method=etgs", f"preset={preset}", "data.size=tiny") for preset in PRESETS]
     for name in ("max_steps", "cap_max"):
         values = [config[name] for config in found]
         assert values == sorted(values) and len(set(values)) == len(PRESETS)
@@ -137,7 +137,7 @@ def test_harmonics_join_within_a_shortened_run_and_where_3dgs_adds_them_in_a_who
 @pytest.mark.parametrize(("method", "preset"), [turn for turn in TURNS if turn[0] != "auto"])
 def test_every_method_trains_with_a_preset(method, preset):
     """First steps of the preset's own schedule, without a trainer; presets take turns."""
-    config = checked(composed(f"method={method}", f"preset={preset}", *BARE))
+    config = checked(composed(f"method={method}", f"preset={preset}", "data.size=tiny"))
     stepper = Stepper(build(config["module"]), build(config["data"]).scene, step=0, device="cpu")
     module = stepper.module
     for step in range(3):
@@ -145,14 +145,14 @@ def test_every_method_trains_with_a_preset(method, preset):
         stepper.step(module.scene.train[step])
     trained = [parameter for parameter in module.parameters() if parameter.grad is not None]
     assert trained and all(parameter.isfinite().all() for parameter in module.parameters())
-    assert module.schedule.end == composed("method=etgs", f"preset={preset}", *BARE)["max_steps"]
+    assert module.schedule.end == composed("method=etgs", f"preset={preset}", "data.size=tiny")["max_steps"]
 
 
 def test_the_parts_that_a_scene_calls_for_train_with_a_preset(tmp_path):
     """A whole run: its parts are chosen as it begins."""
     module, trainer = run(tmp_path, "method=auto", "preset=balanced", *BARE, "trainer.max_steps=3")
     assert trainer.global_step == 3
-    assert module.schedule.end == composed("method=etgs", "preset=balanced", *BARE)["max_steps"]
+    assert module.schedule.end == composed("method=etgs", "preset=balanced", "data.size=tiny")["max_steps"]
 
 
 @pytest.mark.parametrize("method", ["3dgs", "msmg", "ravigs", "mftg"])
