@@ -17,7 +17,6 @@ def trained(tmp_path_factory):
         "method=energy_balance",
         "data.downscale=2",
         "thermal.shadows=true",
-        "thermal.solution=linear",
         "init.count=100",
         "exposure.side=32",
         "normals.views=4",
