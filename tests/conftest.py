@@ -4,15 +4,17 @@ import gc
 import logging
 import os
 import signal
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from quick_compositions import quick_compositions
 from running import filming_once
 
-from heatsplat.training.machine import cores, prepare_machine
+from heatsplat.training.machine import cores, loading, prepare_machine
 
-gc.disable()  # until all is collected: modules and thousands of tests are no garbage
+COLLECTING = ExitStack()  # modules and thousands of tests are no garbage, as libraries of commands are none
+COLLECTING.enter_context(loading())
 
 WORKERS = os.environ.get("PYTEST_XDIST_WORKER_COUNT")
 if WORKERS:  # before torch is imported, which reads it once
@@ -70,9 +72,8 @@ def pytest_xdist_auto_num_workers(config):
 
 
 def pytest_collection_finish():
-    gc.freeze()  # they are not looked through again
+    COLLECTING.close()
     gc.set_threshold(5000, 20, 20)  # in place of 700, 10, 10: configurations come and go by the thousand objects
-    gc.enable()
 
 
 def pytest_collection_modifyitems(items):

@@ -100,7 +100,7 @@ def test_a_model_gives_and_learns_the_same_bits(name):
             found |= {f"seen {k}": seen.detach()} | {f"{name} {k}": x for name, x in zip(learned, slopes, strict=True)}
         return found
 
-    one, *others = with_threads((1, 3, 7), results)
+    one, *others = with_threads((1, 2, 3, 5, 7), results)
     one = {name: found for name, found in one.items() if found is not None}
     assert {f"{name} 0" for name, _ in model.named_parameters()} <= set(one)
     for other in others:
