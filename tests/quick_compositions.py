@@ -16,7 +16,7 @@ from unittest import mock
 import hydra
 import omegaconf
 from hydra import version
-from hydra._internal import defaults_list
+from hydra._internal import config_loader_impl, defaults_list
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
 from hydra.core.config_store import ConfigStore
@@ -33,10 +33,14 @@ def quick_compositions() -> Iterator[None]:
     """
     parse = functools.cache(omegaconf.base.parse)
     read, merge = ConfigRepository.load_config, ConfigLoaderImpl._compose_config_from_defaults_list
+    place = ConfigLoaderImpl._load_single_config
     replaced = (
         (hydra, "compose", _composed_once(hydra.compose)),
         (ConfigRepository, "load_config", _once(read, lambda self, config_path: (self.sources, config_path))),
         (ConfigLoaderImpl, "_compose_config_from_defaults_list", _once(merge, _files)),
+        (ConfigLoaderImpl, "_load_single_config", _once(place, _file)),
+        (config_loader_impl, "create_defaults_list", _listed_once(defaults_list.create_defaults_list)),
+        (omegaconf.base.Box, "_re_parent", _re_parent),
         (defaults_list, "_create_interpolation_map", _where_needed(defaults_list._create_interpolation_map)),
         (version, "_get_version", functools.cache(version._get_version)),  # asked for eight hundred times
         (omegaconf.base, "parse", parse),
@@ -88,6 +92,39 @@ def _once(function: Callable, about: Callable) -> Callable:
 
 def _files(self: Any, defaults: Any, repo: Any) -> tuple[Any, str]:
     return repo.get_sources(), repr([dataclasses.astuple(one) for one in defaults])
+
+
+def _file(self: Any, default: Any, repo: Any) -> tuple[Any, str]:
+    return repo.get_sources(), repr(dataclasses.astuple(default))
+
+
+def _listed_once(listed: Callable) -> Callable:
+    """A list of files to merge, which depends on the options that are chosen, and not on other settings."""
+    known: dict[str, Any] = {}
+
+    def called(repo, config_name, overrides_list, prepend_hydra, skip_missing):
+        chosen = defaults_list.Overrides(repo, overrides_list)
+        about = chosen.override_choices, chosen.append_group_defaults, chosen.deletions
+        key = repr((config_name, about, prepend_hydra, skip_missing))
+        if [source.path for source in repo.get_sources() if source.scheme() == "file"] != [CONF]:
+            return listed(repo, config_name, overrides_list, prepend_hydra, skip_missing)
+        if key not in known:
+            known[key] = listed(repo, config_name, overrides_list, prepend_hydra, skip_missing)
+        return dataclasses.replace(known[key], config_overrides=chosen.config_overrides)
+
+    return called
+
+
+def _re_parent(self: Any) -> None:
+    """As OmegaConf's, which asks every node of the whole configuration for its kind, after each of the merged files."""
+    content = self.__dict__["_content"]
+    held = isinstance(content, (dict, list))
+    for child in (content.values() if isinstance(content, dict) else content) if held else (content,):
+        if isinstance(child, omegaconf.Node):
+            state = child.__dict__
+            state["_parent"], state["_flags_cache"] = self, None
+            if "_content" in state:
+                child._re_parent()
 
 
 def _where_needed(map_of: Callable) -> Callable:
