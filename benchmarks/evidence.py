@@ -81,6 +81,12 @@ better foreseen than surfaces that relax before a camera with an offset and a ga
 behind air that takes a share of its own from each. If that camera foresees better, it cannot be told. The gain is 1.4 to 4.6 dB
 on `heated` (tiny, 16 to 31 images), and -0.1 to -3.1 dB on six random scenes without a lamp whose points seemed to answer one.
 
+**Emissivity and angle.** Surfaces emit less towards their sides: smooth dielectrics only at grazing angles (Schlick's law, the
+fifth power of 1 - cos θ), rough ones earlier (the first power). The joint fit has one falloff for all points
+(`effects/physical/directional_emissivity.py`) and chooses the power. Harmonics of each point also make up for normals that are
+known roughly, and mirrored surroundings follow a falloff a little; before there was such an effect, these took its place.
+Harmonics give way where, at the usual point, the falloff explains four fifths of what they explain.
+
 **Moving heat sources.** Points warmed by a passing hot object each change at a time of their own and share no course. If the
 scene otherwise cools, such points are counted (`effects/joint/moments.py`) and a source with all harmonics models what warms
 them. On `moving_source` there are 4 to 5 times as many as by chance, elsewhere at most 1.5 times.

@@ -128,7 +128,7 @@ def _changing(preset: Preset, state: str, dice: _Dice) -> Preset:
 
 def _glossy(preset: Preset, gloss: str, dice: _Dice) -> Preset:
     if gloss == "dull":
-        return _with(preset, "view_dependence", gloss=Gloss(fade=dice.between(0.2, 0.5)))
+        return _with(preset, "directional_emissivity", gloss=Gloss(fade=dice.between(0.2, 0.5)))
     towards = (dice.between(-1.0, 1.0), dice.between(-1.0, -0.2), dice.between(0.0, 1.0))
     mirrors = Gloss(mirrors=dice.between(0.08, 0.3), warm_k=dice.between(30.0, 80.0), towards=towards)
     return _with(preset, "reflection", gloss=mirrors)

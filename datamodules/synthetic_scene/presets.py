@@ -393,7 +393,7 @@ PRESETS: dict[str, Preset] = {
         effects=_shows("reflection"),
     ),
     "dull": Preset(
-        start_k=_WARM, held=True, surfaces=TABLE_TOP, gloss=Gloss(fade=0.4), effects=_shows("view_dependence")
+        start_k=_WARM, held=True, surfaces=TABLE_TOP, gloss=Gloss(fade=0.4), effects=_shows("directional_emissivity")
     ),
     "weak_texture": Preset(
         start_k=_WARM | _SMOOTH_WALLS,

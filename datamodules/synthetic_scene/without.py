@@ -114,7 +114,7 @@ _OUTSIDE: Mapping[str, Callable[[OutdoorPreset], OutdoorPreset]] = {
 _SURFACES: Mapping[str, Callable[[Preset], Preset]] = {
     "harmonic_source": lambda preset: replace(preset, lamp=None),
     "conduction": lambda preset: replace(preset, diffusivity=0.0),
-    "view_dependence": lambda preset: replace(preset, gloss=replace(preset.gloss, fade=0.0)),
+    "directional_emissivity": lambda preset: replace(preset, gloss=replace(preset.gloss, fade=0.0)),
     "reflection": lambda preset: replace(preset, gloss=replace(preset.gloss, mirrors=0.0)),
     "attenuation": lambda preset: replace(preset, haze=None),
     "thermal_opacity": _no_pane,

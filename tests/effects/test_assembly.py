@@ -77,7 +77,13 @@ def test_conduction_wraps_the_state():
 @pytest.mark.parametrize("name", ON_THE_WAY)
 def test_a_part_stands_in_the_configuration_exactly_when_its_effect_is_on(name):
     everything = assembled(*assembly.NAMES)["thermal"]["parts"]
-    assert list(everything) == ["view_dependence", "reflection", "mirrored_sky", "attenuation"]
+    assert list(everything) == [
+        "directional_emissivity",
+        "view_dependence",
+        "reflection",
+        "mirrored_sky",
+        "attenuation",
+    ]
     assert list(assembled(name)["thermal"]["parts"]) == [name]
 
 

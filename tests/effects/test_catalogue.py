@@ -11,9 +11,9 @@ from heatsplat.effects.catalogue import CATALOGUE, decide
 
 NAMES = (
     "relaxation", "harmonic_source", "semi_infinite", "solar", "radiation", "convection", "conduction", "shadows",
-    "sky_view", "albedo", "view_dependence", "reflection", "mirrored_sky", "attenuation", "thermal_opacity",
-    "point_spread", "thermal_lag", "rolling_readout", "fixed_pattern", "vignetting", "frame_offset", "agc", "tone",
-    "pixel_area",
+    "sky_view", "albedo", "directional_emissivity", "view_dependence", "reflection", "mirrored_sky", "attenuation",
+    "thermal_opacity", "point_spread", "thermal_lag", "rolling_readout", "fixed_pattern", "vignetting", "frame_offset",
+    "agc", "tone", "pixel_area",
 )  # fmt: skip
 
 

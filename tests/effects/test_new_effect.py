@@ -55,7 +55,7 @@ def tilt(tmp_path, monkeypatch):
 
 def test_a_file_adds_an_effect(tilt):
     catalogue, assembly = tilt
-    assert assembly.NAMES[-1] == "tilt" and len(assembly.NAMES) == 25
+    assert assembly.NAMES[-1] == "tilt" and len(assembly.NAMES) == 26
     assert assembly.choices(CONF | {"tilt": True})["tilt"] == "on"
     verdict = catalogue._verdict(catalogue.CATALOGUE[-1], SimpleLook(), "auto")
     assert verdict.on and verdict.settings == {"start": 0.5}

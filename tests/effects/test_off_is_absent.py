@@ -314,6 +314,11 @@ CASES = {
         lambda: ByHand(NewtonHarmonic(frequencies=24)),
         ("log_flow", "edges", "joined"),
     ),
+    "directional_emissivity": Case(
+        ("relaxation", "attenuation"),
+        lambda: ByHand(NewtonHarmonic(frequencies=0, clip="none"), {"attenuation": Attenuation(moments=12)}),
+        ("falloff_logit", "directional_emissivity.", "normals", "normal_tilt"),
+    ),
     "view_dependence": Case(
         ("attenuation",),
         lambda: ByHand(Static(floor=False), {"attenuation": Attenuation(moments=12)}),

@@ -32,7 +32,7 @@ def test_the_drift_of_a_flight_is_the_sensors_and_not_the_heaths():
     for name in ("solar", "radiation", "convection"):
         assert not verdicts[name].on and "lacks weather" in verdicts[name].reason
     # Strips flown straight down see no point from the side or from afar, and there are no visible images.
-    for name in ("view_dependence", "reflection", "attenuation", "thermal_opacity"):
+    for name in ("directional_emissivity", "view_dependence", "reflection", "attenuation", "thermal_opacity"):
         assert not verdicts[name].on, verdicts[name]
     # What else the camera does. Nobody measured it: this is what is found, and found with a wide margin but for the blur.
     assert on(verdicts) == {"frame_offset", "fixed_pattern", "tone", "point_spread"}

@@ -17,6 +17,7 @@ from heatsplat.thermal.base import Query, Seeds
 from heatsplat.thermal.common_source import CommonSource
 from heatsplat.thermal.composed import Composed
 from heatsplat.thermal.conduction import Conducting, _ImplicitStep, laplacian
+from heatsplat.thermal.directional_emissivity import DirectionalEmissivity
 from heatsplat.thermal.newton_harmonic import NewtonHarmonic
 from heatsplat.thermal.reflection import Reflection
 from heatsplat.thermal.static import Static
@@ -31,6 +32,7 @@ STATES = {
 }
 OPEN = {"static": {"floor": False}} | dict.fromkeys(("relaxation", "harmonic", "common"), {"clip": "none"})
 PARTS = {
+    "directional_emissivity": lambda: DirectionalEmissivity(power=1),
     "view_dependence": lambda: ViewDependence(sh_degree_interval=0),
     "reflection": lambda: Reflection(),
     "attenuation": lambda: Attenuation(moments=3),

@@ -13,6 +13,7 @@ from heatsplat.thermal.base import Query, Seeds
 from heatsplat.thermal.common_source import CommonSource
 from heatsplat.thermal.composed import Composed
 from heatsplat.thermal.conduction import Conducting
+from heatsplat.thermal.directional_emissivity import DirectionalEmissivity
 from heatsplat.thermal.energy_balance import EnergyBalance
 from heatsplat.thermal.imaging_field import ImagingField
 from heatsplat.thermal.layers import Head
@@ -33,7 +34,7 @@ MODELS = {
     "harmonics": lambda: NewtonHarmonic(frequencies=4),
     "even surroundings": lambda: Composed(Static(floor=False), {"mirror": Reflection(degree=0)}),
     "surroundings": lambda: Composed(Static(floor=False), {"mirror": Reflection(degree=2)}),
-    "sky": lambda: Composed(Static(floor=False), {"mirror": MirroredSky()}),
+    "sky": lambda: Composed(Static(floor=False), {"mirror": MirroredSky(), "angle": DirectionalEmissivity()}),
     "grey bodies": lambda: Radiative(Static(channels=3, modality="rgb")),
     "bodies in a band": lambda: Radiative(
         Static(channels=3, modality="rgb"), law="band", three_parameter=True, reflectance="kirchhoff"

@@ -27,6 +27,8 @@ FLOOR = 0.1
 # on it.
 MIN_ERROR_PX, MAX_ERROR_PX = 0.05, 0.4
 MEDIAN_OF_CHI2 = 0.455  # of one degree of freedom
+ROUNDS = 3  # of fitting each of several paths beside the others
+LEAST_SHARE = 1e-3  # that arrives, where what was sent is asked for
 FEW = 4.0  # how many observations the usual residual counts for beside a point's own
 
 
@@ -68,6 +70,7 @@ class Fit:
     bases: dict[tuple[str, object], Tensor] = field(default_factory=dict)
     _images: dict[Model, Tensor] = field(default_factory=dict, init=False)
     _qualities: dict[Model, Quality] = field(default_factory=dict, init=False)
+    _passing: dict[Model, dict[str, Tensor]] = field(default_factory=dict, init=False)
 
     # Models ---------------------------------------------------------------------------------------------------
 
@@ -117,10 +120,9 @@ class Fit:
 
     def _quality(self, model: Model) -> Quality:
         """Every point has a noise of its own: a tenth of bad points must not decide for all."""
-        left, size = self.residuals(model), self.own(model)[1].shape[2]
-        squares, counts = (self.weights * left**2).sum(1), (self.weights > 0).sum(1)
+        squares, counts, size = self._squares(model)
         used = counts > 0
-        variances = (squares / (counts - size).clamp_min(1)).clamp_min(FLOOR)[used]
+        variances = _variances(squares, counts, size)[used]
         lengths = counts[used].clamp(max=size).double()
         effects = self.data.effects
         shared = sum(effects[name].term.numbers(self.data, model.kind(name)) for name in effects if name in model.names)
@@ -129,16 +131,52 @@ class Fit:
         bic = float((counts[used] * variances.log()).sum()) + cost
         return Quality(float((squares / self.trust).sum()), float(lengths.sum()) + shared, cost, bic)
 
+    def variances(self, model: Model) -> Tensor:
+        """What a model leaves of each point's values, [P] in squares of the errors expected."""
+        return _variances(*self._squares(model))
+
+    def _squares(self, model: Model) -> tuple[Tensor, Tensor, int]:
+        """Of each point [P] the weighted squares that a model leaves and how many observations count, and the numbers it has."""
+        left = self.residuals(model)
+        return (self.weights * left**2).sum(1), (self.weights > 0).sum(1), self.own(model)[1].shape[2]
+
     # What they make of the values -----------------------------------------------------------------------------
 
     def own(self, model: Model, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """What points' own parts have to explain [P, F], and their basis [P, F, k] as it arrives at the camera."""
         values, basis = self.data.tracks.values, self.own_basis(model)
-        for name, effect in self.terms(model, Path).items():
-            passing = effect.term.passing(self, model.kind(name), basis, self.weights if weights is None else weights)
-            # The surroundings shine through what the path takes away.
-            values, basis = values - self.data.ambient, passing[..., None] * basis
+        if self.terms(model, Path):  # the surroundings shine through what a path takes away
+            shares = self._passed(model) if weights is None else self._shares(model, weights)
+            values, basis = values - self.data.ambient, math.prod(shares.values())[..., None] * basis
         return values, basis
+
+    def before_path(self, model: Model, name: str) -> tuple[Tensor, Tensor, Tensor]:
+        """What one path of a model is fitted to: the excess [P, F] over the surroundings without other paths and what is known
+        of shared effects, the points' own basis [P, F, k], and weights [P, F]."""
+        return self._before(self._passed(model), model, name, self.weights)
+
+    def _passed(self, model: Model) -> dict[str, Tensor]:
+        """``_shares`` by the weights of this state, which effects that are not the points' own do not change; worked out once."""
+        key = model.minus(self.terms(model, Shared))
+        if key not in self._passing:
+            self._passing[key] = self._shares(key, self.weights)
+        return self._passing[key]
+
+    def _shares(self, model: Model, weights: Tensor) -> dict[str, Tensor]:
+        """By name of a path, the share [P, F] of the excess over the surroundings that it lets pass."""
+        paths, shares = self.terms(model, Path), {}
+        for _ in range(1 if len(paths) < 2 else ROUNDS):
+            for name, effect in paths.items():
+                shares[name] = effect.term.passing(self, model.kind(name), *self._before(shares, model, name, weights))
+        return shares
+
+    def _before(
+        self, shares: Mapping[str, Tensor], model: Model, name: str, weights: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        excess = self.data.tracks.values - self.data.ambient - sum(self.known.values())
+        for share in (share for other, share in shares.items() if other != name):
+            excess, weights = excess / share.clamp_min(LEAST_SHARE), weights * share**2
+        return excess, self.own_basis(model), weights
 
     def own_basis(self, model: Model) -> Tensor:
         """The points' own basis [P, F, k] before the path: a level and the bases of a model's effects."""
@@ -272,6 +310,10 @@ def _place_error_px(fit: Fit) -> float:
     excess = float(left[steep].square().median()) / MEDIAN_OF_CHI2 - fit.data.noise**2
     squared = excess / float(slopes[steep].square().median())
     return math.sqrt(min(max(squared, MIN_ERROR_PX**2), MAX_ERROR_PX**2))
+
+
+def _variances(squares: Tensor, counts: Tensor, size: int) -> Tensor:
+    return (squares / (counts - size).clamp_min(1)).clamp_min(FLOOR)
 
 
 def _median(values: Tensor, keep: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ from heatsplat.effects.joint.model import Model
 # Share of the changes that any effect must exceed where a weather record, whose answers are rough, explains them.
 BESIDE_WEATHER = 0.2
 MAX_STEPS = 12
+MOST = 0.8  # share of what many numbers explain at the usual point from which few make do
 
 
 def selected(start: Fit) -> tuple[Fit, Model]:
@@ -47,9 +48,39 @@ def selected(start: Fit) -> tuple[Fit, Model]:
         if model not in ends:
             ends.append(model)
     model = min(ends, key=lambda end: start.linearised(end).linearised(end).quality(end).bic)
+    model = given_way(start, model)
     fit = start.accepted(model).accepted(model)
     fit, model = grown(fit, pruned(fit, model), effects)
     return warmed(start, fit, model)
+
+
+def given_way(start: Fit, model: Model) -> Model:
+    """The model with effects of few numbers in the place of those of many that explain hardly more.
+
+    Taken in first, those of many would leave nothing for these to explain.
+    """
+    effects = start.data.effects
+    for name in sorted(model.names):
+        neither, found = start.without(model, name), []
+        for other in (one for one in effects[name].term.gives_way_to if one in effects and one not in model.names):
+            for kind in effects[other].term.kinds(start):
+                few = neither.plus(other, kind)
+                fit = start.accepted(few).accepted(few)
+                if makes_do(fit, few, model, neither) and earns(fit, few, neither, other):
+                    found.append((fit.quality(few).bic, few))
+        model = min(found, key=lambda one: one[0], default=(0.0, model))[1]
+    return model
+
+
+def makes_do(fit: Fit, few: Model, many: Model, neither: Model) -> bool:
+    """Whether at the usual point a model of few numbers explains most of what one of many explains.
+
+    Numbers of each point also make up for what is known roughly of what few numbers are about, such as normals at edges. So all
+    points together prefer them even where there is nothing else.
+    """
+    explained, possible = (fit.variances(neither) - fit.variances(one) for one in (few, many))
+    shares = (explained / possible)[possible > 0]
+    return len(shares) > 0 and float(shares.median()) > MOST
 
 
 def warmed(start: Fit, fit: Fit, model: Model) -> tuple[Fit, Model]:
@@ -124,6 +155,9 @@ def worthwhile(fit: Fit, more: Model, less: Model, name: str) -> bool:
     term, size = fit.data.effects[name].term, fit.effect_size(more, less)
     if size < term.smallest or not all(rule(fit, more, less) for rule in term.rules):
         return False
+    for other in less.names.intersection(term.gives_way_to):
+        if makes_do(fit, less, more.minus({other}), less.minus({other})):
+            return False
     at_rest = fit.at_rest(less)
     rough = fit.data.drivers is not None and ANY not in less.names
     share = BESIDE_WEATHER if rough else term.beside_changes

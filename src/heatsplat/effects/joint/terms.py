@@ -54,6 +54,7 @@ class Term:
         single_images: whether its numbers belong to single images.
         rivals: effects by name, one or several together, that look so much like it that it has to outdo them on held-out
             observations to be told.
+        gives_way_to: effects of fewer numbers by name: it is not there where one of them makes do (``selection.makes_do``).
         told_by: rules that it has to meet to be told, beside those by which it is taken in, and what it is that does not meet
             them.
         sensor_first: whether one way of the selection tries it before the other effects.
@@ -71,6 +72,7 @@ class Term:
     in_time: bool = False
     single_images: bool = False
     rivals: Sequence[tuple[str, ...]] = ()
+    gives_way_to: Sequence[str] = ()
     told_by: Sequence[tuple[Callable[[Fit, Model, Model], bool], str]] = ()
     sensor_first: bool = False
     smallest: float = SMALLEST
@@ -114,11 +116,11 @@ class Path(Term):
     """An effect between surface and camera.
 
     Args:
-        passing: (Fit, kind, basis [P, F, k], weights [P, F]) -> the share [P, F] of the excess over the surroundings that
-            arrives.
+        passing: (Fit, kind, excess [P, F] over the surroundings without other paths, basis [P, F, k], weights [P, F]) -> the
+            share [P, F] of the excess that arrives.
     """
 
-    passing: Callable[[Fit, object, Tensor, Tensor], Tensor]
+    passing: Callable[[Fit, object, Tensor, Tensor, Tensor], Tensor]
 
 
 def well_seen(numbers: int) -> int:

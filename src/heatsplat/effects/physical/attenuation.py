@@ -35,7 +35,7 @@ def evidence(inspected: Inspection) -> Evidence:
     if kind is None:
         return found
     fit, model = inspected.joint
-    per_unit, _ = extinctions(fit, kind, fit.own_basis(model), fit.weights)
+    per_unit, _ = extinctions(fit, kind, *fit.before_path(model, "attenuation"))
     return replace(found, settings=settings(per_unit * inspected.given.distance, inspected))
 
 
@@ -54,19 +54,18 @@ def settings(depths: Tensor, inspected: Inspection) -> dict[str, Any]:
     return {"depth": [round(depth, 4) for depth in curve.tolist()], "moments": count}
 
 
-def passing(fit: Fit, kind: object, basis: Tensor, weights: Tensor) -> Tensor:
+def passing(fit: Fit, kind: object, excess: Tensor, basis: Tensor, weights: Tensor) -> Tensor:
     """Share of the excess over the surroundings that arrives [P, F]."""
-    depths, columns = extinctions(fit, kind, basis, weights)
+    depths, columns = extinctions(fit, kind, excess, basis, weights)
     return torch.exp(-(columns @ depths))
 
 
-def extinctions(fit: Fit, kind: object, basis: Tensor, weights: Tensor) -> tuple[Tensor, Columns]:
+def extinctions(fit: Fit, kind: object, excess: Tensor, basis: Tensor, weights: Tensor) -> tuple[Tensor, Columns]:
     """Extinctions [c], and what each counts for in an observation: distances in world units, or for ``EVEN`` 1.
 
-    log(value - ambient) is linear in the extinction (Beer-Lambert), so it comes from one linear fit there.
+    The logarithm of the excess is linear in the extinction (Beer-Lambert), so it comes from one linear fit there.
     """
     tracks = fit.data.tracks
-    excess = tracks.values - fit.data.ambient
     sign = torch.sign((excess * tracks.weights).sum(1, keepdim=True))
     clear = (excess.abs() > 8.0 * fit.errors) & (excess * sign > 0)
     logs = torch.where(clear, excess.abs(), torch.ones_like(excess)).log()

@@ -10,7 +10,7 @@ from heatsplat.effects.weathered import MIRRORED, SIGMAS, around
 EFFECT = Effect(
     name="mirrored_sky",
     stage="emission",
-    place=2,
+    place=3,
     summary="the sky, reflected by surfaces of low emissivity",
     source="Kirchhoff's law under a sky of one optical depth (Elsasser 1942)",
     needs=frozenset({"time", "thermal_range", "weather"}),

@@ -35,7 +35,7 @@ def kinds(fit: Fit) -> Sequence[object]:
 EFFECT = Effect(
     name="reflection",
     stage="emission",
-    place=1,
+    place=2,
     summary="mirror reflection of the surroundings",
     source="RaViGS, Eq. 5",
     null="view dependence does not follow the reflected ray",
@@ -50,7 +50,7 @@ EFFECT = Effect(
         kinds=kinds,
         numbers=lambda data, kind: 8,
         unseen=lambda data: "the points show no surface",
-        rivals=(("view_dependence",),),
+        rivals=(("directional_emissivity",),),
         smallest=0.2,  # misplaced points go with direction a little
         beside_changes=0.04,
     ),
