@@ -191,4 +191,5 @@ def test_every_preset_says_what_it_shows_and_many_are_told_apart():
     assert sum(len(preset.effects) > 1 for preset in presets.values()) >= 5
     elsewhere = {"shadows", "sky_view", "albedo", "mirrored_sky"}  # asked for
     elsewhere |= {"semi_infinite", "pixel_area"}  # of a wall, stone; of data.degrade
+    elsewhere |= {"view_dependence"}  # of what neither mirrors nor emits less towards its sides
     assert set().union(*(preset.effects for preset in presets.values())) == names - elsewhere
