@@ -12,6 +12,7 @@ from heatsplat.effects.catalogue import CATALOGUE
 
 NOT_DRAWN = {"semi_infinite", "thermal_lag", "rolling_readout"}  # they need a camera that moves fast
 NOT_DRAWN |= {"pixel_area"}  # sizes of images tell it
+NOT_DRAWN |= {"view_dependence"}  # what neither mirrors nor emits less towards its sides is not drawn
 NOT_DRAWN |= {"shadows", "sky_view", "albedo", "mirrored_sky"}  # no test of images tells them yet
 MANY = [drawn(number) for number in range(150)]
 
