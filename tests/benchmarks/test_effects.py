@@ -131,7 +131,8 @@ def test_the_truth_of_its_configuration_is_that_of_the_scenes():
         "mirrored_sky",
         "semi_infinite",
         "pixel_area",
-    }  # asked for; of a wall; of data.degrade
+        "view_dependence",
+    }  # asked for; of a wall; of data.degrade; of what neither mirrors nor emits less towards its sides
     assert set().union(*truth.values()) == set(assembly.NAMES) - unseen  # every other effect is there somewhere
 
 
