@@ -63,13 +63,7 @@ class Attenuation(HeatPart):
 
     def prepare(self, scene: SceneData) -> None:
         self.typical.fill_(scene.distance)
-        known = scene.thermal_range is not None and scene.ambient_c is not None
-        level = torch.tensor(scene.thermal_range.to_unit(scene.ambient_c) if known else 0.5)
-        if known:
-            self.level.copy_(level)
-        else:
-            del self.level
-            self.level = nn.Parameter(level)
+        self.know_surroundings(scene)
         if self.moments > 0 and "time" not in scene.metadata:
             self.moments = 0
             del self.clock

@@ -57,11 +57,7 @@ class DirectionalEmissivity(HeatPart):
         self.register_buffer("level", torch.tensor(0.5))
 
     def prepare(self, scene: SceneData) -> None:
-        if scene.thermal_range is not None and scene.ambient_c is not None:
-            self.level.fill_(scene.thermal_range.to_unit(scene.ambient_c))
-        else:
-            del self.level
-            self.level = nn.Parameter(torch.tensor(0.5))
+        self.know_surroundings(scene)
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         tilts = {"normal_tilt": PerGaussian(torch.zeros_like(seeds.means), self.lr_tilt)} if self.lr_tilt > 0 else {}
@@ -79,10 +75,8 @@ class DirectionalEmissivity(HeatPart):
         normals = query.normals(splats)
         if self.lr_tilt > 0:
             normals = normals + query.rows(splats["normal_tilt"])
-        facing = (sight * normals).sum(1, keepdim=True).abs()
-        if self.lr_tilt > 0:
-            facing = facing / normals.square().sum(1, keepdim=True).clamp(min=SHORTEST**2).sqrt()
-        facing = facing.clamp(max=1.0)
+            normals = normals / normals.square().sum(1, keepdim=True).clamp(min=SHORTEST**2).sqrt()
+        facing = (sight * normals).sum(1, keepdim=True).abs().clamp(max=1.0)
         slant = math.prod([1.0 - facing] * self.power)  # torch's power has other bits on another number of threads
         return everywhere(sigmoid(self.falloff_logit), slant) * slant
 

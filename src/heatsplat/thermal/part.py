@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
+from heatsplat.contracts import SceneData
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Heat, Query
 
@@ -17,6 +19,18 @@ class HeatPart(Heat):
     """
 
     beyond_record = ""
+    level: Tensor
+
+    def know_surroundings(self, scene: SceneData) -> None:
+        """Of a part with a buffer ``level``, the image value of the surroundings []: sets it where their temperature was measured;
+        else it becomes a parameter, which starts in the middle of the range."""
+        known = scene.thermal_range is not None and scene.ambient_c is not None
+        level = torch.tensor(scene.thermal_range.to_unit(scene.ambient_c) if known else 0.5)
+        if known:
+            self.level.copy_(level)
+        else:
+            del self.level
+            self.level = nn.Parameter(level)
 
     @abstractmethod
     def forward(self, values: Tensor, splats: Splats, query: Query) -> Tensor:

@@ -28,7 +28,7 @@ EFFECT = Effect(
     summary="emission that depends on the direction of view",
     source="3DGS, spherical harmonics",
     null="a point looks the same from every direction",
-    # Up to 1.7 without it, from 4.7 with it.
+    # Up to 1.7 without it; 4.7 where a falloff of emissivity, which is an effect of its own, is all that there is.
     threshold=OWN_HURDLE,
     adds="harmonics for each Gaussian",
     evidence=evidence,
