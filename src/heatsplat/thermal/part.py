@@ -22,8 +22,8 @@ class HeatPart(Heat):
     level: Tensor
 
     def know_surroundings(self, scene: SceneData) -> None:
-        """Of a part with a buffer ``level``, the image value of the surroundings []: sets it where their temperature was measured;
-        else it becomes a parameter, which starts in the middle of the range."""
+        """Of a part with a buffer ``level``, the image value of the surroundings []: sets it where their temperature was
+        measured; else it becomes a parameter, which starts in the middle of the range."""
         known = scene.thermal_range is not None and scene.ambient_c is not None
         level = torch.tensor(scene.thermal_range.to_unit(scene.ambient_c) if known else 0.5)
         if known:
