@@ -13,9 +13,11 @@ import numba
 import numpy as np
 import pytest
 from commands import SOURCES, forking, succeeds
+from numba.misc import appdirs
 
 from heatsplat.kernels import compilation
 from heatsplat.kernels.compilation import exact_kernel, kernel
+from heatsplat.kernels.compile_time import ConstantType
 
 
 def double(numbers):
@@ -119,6 +121,7 @@ def places(kept, tmp_path, monkeypatch) -> dict[str, Path]:
     monkeypatch.setattr(compilation, "_SOURCES", [source, Path(__file__)])
     monkeypatch.setattr(compilation, "_WRITTEN", compilation._when_written())
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
+    monkeypatch.setattr(appdirs, "system", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
     monkeypatch.chdir(tmp_path)
     return {
@@ -128,7 +131,6 @@ def places(kept, tmp_path, monkeypatch) -> dict[str, Path]:
     }
 
 
-@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="the user's folder is another there")
 @pytest.mark.parametrize("blocked", [0, 1, 2])
 def test_the_first_folder_that_can_be_written_is_taken(places, blocked):
     for variable in [*places][:blocked]:
@@ -138,7 +140,6 @@ def test_the_first_folder_that_can_be_written_is_taken(places, blocked):
     assert [bool(list(place.glob("*.nbc"))) for place in places.values()] == [k == blocked for k in range(3)]
 
 
-@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="the user's folder is another there")
 def test_a_home_that_is_not_known_is_not_the_working_directory(places, tmp_path, monkeypatch):
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
@@ -279,7 +280,8 @@ class Machine:
 
 
 def test_a_name_holds_all_that_the_code_depends_on(folder, monkeypatch):
-    one, other = (numba.float64[:],), (numba.float32[:],)
+    one, read_only = (numba.float64[:],), numba.types.Array(numba.float64, 1, "A", readonly=True)
+    others = [(numba.float32[:],), (read_only,), (ConstantType(Path("a")),), (ConstantType(Path("b")),)]
     machine = Machine("x86_64", "skylake", "+avx,+avx2")
 
     def name(compiled=double, signature=one, machine=machine, decorate=kernel) -> Path:
@@ -289,7 +291,7 @@ def test_a_name_holds_all_that_the_code_depends_on(folder, monkeypatch):
     assert name() == before
     names = {
         before,
-        name(signature=other),
+        *(name(signature=signature) for signature in others),
         name(machine=Machine("x86_64", "haswell", "+avx,+avx2")),
         name(machine=Machine("x86_64", "skylake", "+avx,-avx2")),
         name(decorate=exact_kernel),
@@ -303,7 +305,7 @@ def test_a_name_holds_all_that_the_code_depends_on(folder, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(owner, attribute, "another")
             names.add(name())
-    assert len(names) == 6 + len(changes)
+    assert len(names) == 5 + len(others) + len(changes)
     assert name() == before
 
 
