@@ -91,6 +91,8 @@ def test_damaged_files_are_written_anew_and_said_once(folder, caplog, damage):
 
 
 def test_a_full_disk_is_said_once(folder, caplog, monkeypatch):
+    aged(folder / "old.nbc", 31)  # makes room, at least
+
     def full(path, data):
         with path.open("wb") as file:
             file.write(data[: len(data) // 2])
@@ -102,6 +104,18 @@ def test_a_full_disk_is_said_once(folder, caplog, monkeypatch):
     (line,) = caplog.messages
     assert str(folder) in line and "No space left" in line
     assert list(folder.iterdir()) == []
+
+
+def test_a_file_that_another_process_reads_stays_without_a_word(folder, caplog, monkeypatch):
+    def refuse(*_):
+        raise PermissionError("in use")  # as on Windows
+
+    compiled = doubled_anew()
+    ((signature, result),) = compiled.overloads.items()
+    monkeypatch.setattr(Path, "replace", refuse)
+    compiled._cache.save_overload(signature, result)
+    assert caplog.messages == [] and len(list(folder.iterdir())) == 1
+    assert was_loaded(doubled_anew())
 
 
 def test_a_folder_that_vanishes_is_made_and_filled_again(folder):
@@ -350,10 +364,10 @@ def test_what_is_loaded_counts_as_used_and_loading_removes_nothing(folder):
 def test_of_more_than_there_is_room_for_the_longest_unused_goes(folder, monkeypatch):
     doubled_anew()
     (own,) = folder.glob("*.nbc")
-    monkeypatch.setattr(compilation, "_ROOM_BYTES", own.stat().st_size + 9)
+    own.unlink()
+    monkeypatch.setattr(compilation, "_ROOM_BYTES", 9)
     files = [aged(folder / f"{days}.nbc", days) for days in (3, 1, 2, 4)]
     compilation._tidy.cache_clear()
-    own.unlink()
     doubled_anew()
     assert own.exists() and [path.exists() for path in files] == [False, True, True, False]
 

@@ -113,6 +113,7 @@ class _Cache(NullCache):
         path = self._path(signature, result.codegen)
         unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex[:16]}")
         try:
+            _tidy(self._folder)
             code = dumps(result._replace(type_annotation="")._reduce())  # a listing of the source, with its path
             self._folder.mkdir(parents=True, exist_ok=True)
             unfinished.write_bytes(hashlib.sha256(code).digest() + code)
@@ -125,7 +126,6 @@ class _Cache(NullCache):
                     f"the kernels' cache in {self._folder} cannot be written ({getattr(error, 'strerror', None) or error}): "
                     "until it can, each run compiles them; make room, or set NUMBA_CACHE_DIR to another folder"
                 )
-        _tidy(self._folder)
 
 
 @functools.cache  # once in a process, which has compiled something
