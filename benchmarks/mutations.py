@@ -279,7 +279,7 @@ def first_failure(mutation: Mutation) -> str | None:
         for stream in (contextlib.redirect_stdout, contextlib.redirect_stderr):
             stack.enter_context(stream(io.StringIO()))
         if mutation.module.startswith("kernels."):
-            # Compiled code is kept by the file that it is of, which does not change: neither may take the other's.
+            # Compiled code is kept by the content of files, which does not change: neither may take the other's.
             os.environ["NUMBA_CACHE_DIR"] = stack.enter_context(tempfile.TemporaryDirectory())
         options = ["-x", "-q", "-p", "no:cacheprovider", f"--rootdir={ROOT}", "-c", str(ROOT / "pyproject.toml")]
         code = pytest.main([*(str(ROOT / w) if w.startswith("tests/") else w for w in words), *options], [recorder])

@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import functools
-import glob
 import hashlib
 import logging
+import os
 import pickle
+import sys
+import tempfile
 import threading
+import time
+import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import llvmlite
 import numba
+import numpy as np
+from llvmlite.binding import llvm_version_info
 from numba.core import event
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.caching import NullCache
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler import CompilerBase, CompileResult, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.serialize import dumps
 from numba.core.typed_passes import NativeLowering
 from numba.core.untyped_passes import DeadBranchPrune
+from numba.misc.appdirs import AppDirs
 from numba.np.ufunc.parallel import _launch_threads
 
 from heatsplat.kernels.compile_time import FoldConstants
@@ -32,11 +40,22 @@ log = logging.getLogger(__name__)
 # nothing (measured: the image is wrong by 0.21), 'nnan' because comparisons with NaN must stay false: they cull.
 FASTMATH = {"contract", "nsz", "arcp"}
 
-# Numba's cache looks only at the file of the function itself; with this in the names of its files it also notices
-# changed helpers in other files, and never unpickles types of another version of this package.
-_FINGERPRINT = hashlib.sha256(
-    b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-).hexdigest()[:12]
+# All that kernels are made of; gpu/ is Triton's.
+_SOURCES = sorted(Path(__file__).parent.glob("*.py"))
+
+
+def _when_written() -> list[int]:
+    return [path.stat().st_mtime_ns for path in _SOURCES]
+
+
+# A process that imports other files later may have a mixture of these and of newer ones: it notices by the times.
+_WRITTEN = _when_written()
+_FINGERPRINT = [hashlib.sha256(path.read_bytes()).hexdigest() for path in _SOURCES]
+
+# Of Numba's, what changes the code.
+_SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT", "USING_SVML")
+
+_UNUSED_SECONDS, _ROOM_BYTES = 30 * 86400, 2**30
 
 
 @functools.cache  # of many kernels in one folder, the first says it for all
@@ -44,57 +63,112 @@ def _warn_once(message: str) -> None:
     log.warning(message)
 
 
-class _CacheFiles(CompileResultCacheImpl):
-    """What lies in a file of the cache: a hash and what it is of, for damaged instructions would crash the process."""
+class _Cache(NullCache):
+    """A file for each function and the types that it is compiled for, named after all that its code depends on.
 
-    def get_filename_base(self, fullname: str, abiflags: str) -> str:
-        return f"{super().get_filename_base(fullname, abiflags)}-{_FINGERPRINT}"
+    These are contents and versions and no path or time, so that checkouts, environments and wheels share the files. Nor is there
+    an index as Numba keeps it, in which processes that write at once give two kernels one file.
+    """
 
-    def reduce(self, result: Any) -> tuple[bytes, bytes]:
-        code = dumps(super().reduce(result))
-        return hashlib.sha256(code).digest(), code
+    def __init__(self, function: Callable, fastmath: set[str], folder: Path) -> None:
+        self._function, self._fastmath, self._folder = function, sorted(fastmath), folder
 
-    def rebuild(self, context: Any, payload: tuple[bytes, bytes]) -> Any:
-        digest, code = payload
-        if hashlib.sha256(code).digest() != digest:
-            raise ValueError("damaged")
-        return super().rebuild(context, pickle.loads(code))
+    @property
+    def cache_path(self) -> str:
+        return str(self._folder)
 
-
-class _Cache(FunctionCache):
-    """Numba's cache of a function in a folder; whatever is wrong with the folder costs time, not the run."""
-
-    _impl_class = _CacheFiles
+    def _path(self, signature: Any, codegen: Any) -> Path:
+        function = self._function
+        name = (function.__module__, function.__qualname__, function.__code__.co_firstlineno)
+        versions = (sys.version, numba.__version__, llvmlite.__version__, llvm_version_info, np.__version__)
+        settings = [getattr(numba.config, setting) for setting in _SETTINGS]
+        # Machines that share a home share no instructions: the tuple holds the name of the processor and what it can do.
+        of = (_FINGERPRINT, name, self._fastmath, signature, versions, settings, codegen.magic_tuple())
+        key = hashlib.sha256(repr(of).encode()).hexdigest()[:32]
+        return self._folder / f"{function.__module__.rpartition('.')[2]}.{function.__name__}-{key}.nbc"
 
     def load_overload(self, signature: Any, context: Any) -> Any:
+        context.refresh()
+        path = self._path(signature, context.codegen())
         try:
-            return super().load_overload(signature, context)
-        except Exception:  # reading what was cut off raises anything
-            _warn_once(f"the kernels' cache in {self.cache_path} is damaged: what cannot be read is compiled anew")
+            data = path.read_bytes()
+        except OSError:
+            return None
+        try:
+            if hashlib.sha256(data[32:]).digest() != data[:32]:  # damaged instructions would crash the process
+                raise ValueError("damaged")
+            result = CompileResult._rebuild(context, *pickle.loads(data[32:]))
+        except Exception:
+            _warn_once(f"the kernels' cache in {self._folder} is damaged: what cannot be read is compiled anew")
             with suppress(OSError):
-                for path in Path(self.cache_path).glob(f"{glob.escape(self._impl.filename_base)}.*"):
-                    path.unlink(missing_ok=True)
-        return None
+                path.unlink()
+            return None
+        with suppress(OSError):
+            os.utime(path)  # it is in use
+        return result
 
     def save_overload(self, signature: Any, result: Any) -> None:
+        if result.library.has_dynamic_globals:  # addresses in this process
+            return
+        path = self._path(signature, result.codegen)
+        unfinished = path.with_name(f"{path.name}.{uuid.uuid4().hex[:16]}")
         try:
-            super().save_overload(signature, result)
+            _tidy(self._folder)
+            code = dumps(result._replace(type_annotation="")._reduce())  # a listing of the source, with its path
+            self._folder.mkdir(parents=True, exist_ok=True)
+            unfinished.write_bytes(hashlib.sha256(code).digest() + code)
+            unfinished.replace(path)
         except Exception as error:
-            _warn_once(
-                f"the kernels' cache in {self.cache_path} cannot be written ({getattr(error, 'strerror', None) or error}): "
-                "until it can, each run compiles them; make room, or set NUMBA_CACHE_DIR to another folder"
-            )
+            with suppress(OSError):
+                unfinished.unlink()
+            if not path.exists():  # Windows lets nobody replace what another process reads
+                _warn_once(
+                    f"the kernels' cache in {self._folder} cannot be written ({getattr(error, 'strerror', None) or error}): "
+                    "until it can, each run compiles them; make room, or set NUMBA_CACHE_DIR to another folder"
+                )
 
 
-def _cache_on_disk(compiled: Any, function: Callable) -> None:
-    """Beside the source, or in the user's folder of caches where that cannot be written; NUMBA_CACHE_DIR goes first."""
-    try:
-        compiled._cache = _Cache(function)
-    except (RuntimeError, OSError):
-        _warn_once(
-            f"no folder for compiled kernels can be written, neither {Path(__file__).parent / '__pycache__'} nor the "
-            "user's own: each run compiles them; set NUMBA_CACHE_DIR to a folder that can be written"
-        )
+@functools.cache  # once in a process, which has compiled something
+def _tidy(folder: Path) -> None:
+    """Removes what nobody has used for a month, and beyond a gigabyte what has not been used for longest."""
+    found = []
+    for path in folder.glob("*.nbc*"):
+        with suppress(OSError):  # another process removes, too
+            found.append((path.stat(), path))
+    taken = 0
+    for status, path in sorted(found, key=lambda each: each[0].st_mtime, reverse=True):
+        taken += status.st_size
+        if taken > _ROOM_BYTES or status.st_mtime < time.time() - _UNUSED_SECONDS:
+            with suppress(OSError):
+                path.unlink()
+
+
+@functools.cache
+def _folder(given: str) -> Path | None:
+    """In ``given`` (NUMBA_CACHE_DIR), or of the user, or beside the sources: the first that can be written."""
+    user = Path(AppDirs("heatsplat", appauthor=False).user_cache_dir, "kernels")
+    beside = _SOURCES[0].parent / "__pycache__"
+    for folder in (Path(given, "heatsplat").absolute() if given else user, user, beside):
+        with suppress(OSError):
+            if folder.is_absolute():  # without a home, the user's is not
+                folder.mkdir(parents=True, exist_ok=True)
+                tempfile.TemporaryFile(dir=folder).close()
+                return folder
+    _warn_once(
+        f"no folder for compiled kernels can be written, neither {user} nor {beside}: each run compiles them; set "
+        "NUMBA_CACHE_DIR to a folder that can be written"
+    )
+    return None
+
+
+def _cache_on_disk(compiled: Any, function: Callable, fastmath: set[str]) -> None:
+    """Only of what the fingerprint is of: nobody knows which files a kernel of another folder is made of."""
+    if Path(function.__code__.co_filename) not in _SOURCES or function.__closure__:
+        return
+    with suppress(OSError):  # it is being edited
+        if _when_written() == _WRITTEN:
+            folder = _folder(os.environ.get("NUMBA_CACHE_DIR") or numba.config.CACHE_DIR)
+            compiled._cache = _Cache(function, fastmath, folder) if folder else NullCache()
 
 
 # Numba's 'workqueue' threads, the fallback where there is no OpenMP, abort the process if two Python threads use them
@@ -127,7 +201,7 @@ def _manager(name: str, passes: list[tuple[type, str]]) -> PassManager:
 def kernel(function: Callable, fastmath: set[str] = FASTMATH) -> Callable:
     """``function`` compiled for Python callers: without the GIL, cached on disk; it may use ``parallel_for``."""
     compiled = numba.njit(fastmath=fastmath, error_model="numpy", nogil=True, pipeline_class=_Compiler)(function)
-    _cache_on_disk(compiled, function)
+    _cache_on_disk(compiled, function, fastmath)
 
     @functools.wraps(function)
     def call(*arguments: Any) -> Any:
