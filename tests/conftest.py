@@ -92,6 +92,9 @@ def pytest_collection(session):
 
 def pytest_collection_finish():
     COLLECTING.close()
+    for name, one in logging.root.manager.loggerDict.items():
+        if name.startswith("torch.") and isinstance(one, logging.Logger):
+            one.propagate = True  # pytest listens to each that does not, six times for every test
     gc.set_threshold(5000, 20, 20)  # in place of 700, 10, 10: configurations come and go by the thousand objects
 
 
@@ -108,9 +111,15 @@ def pytest_collection_modifyitems(items):
 def logging_as_it_was():
     """A command that runs in the test process sets logging up for itself; the next test starts from what was there."""
     root, found = logging.getLogger(), logging.root.manager.loggerDict
-    level, muted, names = root.level, root.manager.disable, set(found)
-    before = {name: (one.level, one.disabled, one.propagate) for name, one in found.items() if hasattr(one, "level")}
+
+    def settings():
+        each = {name: (one.level, one.disabled, one.propagate) for name, one in found.items() if hasattr(one, "level")}
+        return root.level, root.manager.disable, each
+
+    (level, muted, before), names = settings(), set(found)
     yield
+    if settings() == (level, muted, before):
+        return
     root.setLevel(level)
     logging.disable(muted)
     for name, one in found.items():
