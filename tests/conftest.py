@@ -1,10 +1,12 @@
 """Test processes side by side (pytest -n) share the cores and the films of synthetic scenes; each composes a setting once."""
 
 import gc
+import importlib
 import logging
 import os
 import signal
-from contextlib import ExitStack
+import sys
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,10 @@ from heatsplat.training.machine import cores, loading, prepare_machine
 
 COLLECTING = ExitStack()  # modules and thousands of tests are no garbage, as libraries of commands are none
 COLLECTING.enter_context(loading())
+COMPOSING = ExitStack()  # also what is composed for the names of tests, while they are collected
+COMPOSING.enter_context(quick_compositions())
+
+os.environ.setdefault("HYPOTHESIS_NO_PLUGINS", "1")  # those of other libraries, whose import takes longer than its own
 
 WORKERS = os.environ.get("PYTEST_XDIST_WORKER_COUNT")
 if WORKERS:  # before torch is imported, which reads it once
@@ -71,9 +77,29 @@ def pytest_xdist_auto_num_workers(config):
     return cores()
 
 
+def pytest_collection(session):
+    """Files of tests are rewritten for their assertions, which takes ten seconds where no cache has them: each process begins
+    with a share of its own and finds the others rewritten."""
+    if WORKERS:
+        own = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"))
+        folders = [Path(place) for place in session.config.args if Path(place).is_dir()]
+        for file in sorted(file for folder in folders for file in folder.rglob("test_*.py"))[own :: int(WORKERS)]:
+            if str(file.parent) not in sys.path:
+                sys.path.insert(0, str(file.parent))
+            with suppress(Exception, pytest.skip.Exception):  # the second import says what it is
+                importlib.import_module(file.stem)
+
+
 def pytest_collection_finish():
     COLLECTING.close()
+    for name, one in logging.root.manager.loggerDict.items():
+        if name.startswith("torch.") and isinstance(one, logging.Logger):
+            one.propagate = True  # pytest listens to each that does not, six times for every test
     gc.set_threshold(5000, 20, 20)  # in place of 700, 10, 10: configurations come and go by the thousand objects
+
+
+def pytest_unconfigure():
+    COMPOSING.close()
 
 
 def pytest_collection_modifyitems(items):
@@ -85,9 +111,15 @@ def pytest_collection_modifyitems(items):
 def logging_as_it_was():
     """A command that runs in the test process sets logging up for itself; the next test starts from what was there."""
     root, found = logging.getLogger(), logging.root.manager.loggerDict
-    level, muted, names = root.level, root.manager.disable, set(found)
-    before = {name: (one.level, one.disabled, one.propagate) for name, one in found.items() if hasattr(one, "level")}
+
+    def settings():
+        each = {name: (one.level, one.disabled, one.propagate) for name, one in found.items() if hasattr(one, "level")}
+        return root.level, root.manager.disable, each
+
+    (level, muted, before), names = settings(), set(found)
     yield
+    if settings() == (level, muted, before):
+        return
     root.setLevel(level)
     logging.disable(muted)
     for name, one in found.items():
@@ -100,12 +132,6 @@ def logging_as_it_was():
 def threads_as_told():
     """Before anything is timed or compared: a first kernel starts its threads, which sets torch's number to all cores."""
     prepare_machine(None)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def configurations_read_once():
-    with quick_compositions():
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,9 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.plugins.config_source import ConfigResult
+from omegaconf import DictConfig, OmegaConf, flag_override
+from omegaconf.errors import OmegaConfBaseException
 
 from heatsplat.composition import CONF
 
@@ -36,8 +39,8 @@ def quick_compositions() -> Iterator[None]:
     place = ConfigLoaderImpl._load_single_config
     replaced = (
         (hydra, "compose", _composed_once(hydra.compose)),
-        (ConfigRepository, "load_config", _once(read, lambda self, config_path: (self.sources, config_path))),
-        (ConfigLoaderImpl, "_compose_config_from_defaults_list", _once(merge, _files)),
+        (ConfigRepository, "load_config", _read_once(read)),
+        (ConfigLoaderImpl, "_compose_config_from_defaults_list", _merged_once(merge)),
         (ConfigLoaderImpl, "_load_single_config", _once(place, _file)),
         (config_loader_impl, "create_defaults_list", _listed_once(defaults_list.create_defaults_list)),
         (omegaconf.base.Box, "_re_parent", _re_parent),
@@ -68,11 +71,46 @@ def _composed_once(compose: Callable) -> Callable:
         if files != [CONF] or any("searchpath" in text for text in overrides):
             return compose(config_name, list(overrides), return_hydra_config)
         key = config_name, tuple(overrides), return_hydra_config, os.getcwd()
-        if key not in known:
-            known[key] = pickle.dumps(compose(config_name, list(overrides), return_hydra_config))
-        return pickle.loads(known[key])
+        if key in known:
+            return pickle.loads(known[key])
+        found = compose(config_name, list(overrides), return_hydra_config)
+        known[key] = pickle.dumps(found)
+        return found
 
     return composed
+
+
+def _ours(sources: Any) -> bool:
+    return [source.path for source in sources if source.scheme() == "file"] == [CONF]
+
+
+class _Read(ConfigResult):
+    """A file as it was read; most are asked for their place and their defaults alone, and only some for their settings."""
+
+    def __init__(self, result: ConfigResult) -> None:
+        self.__dict__.update(vars(result), settings=pickle.dumps(result.config))
+        del self.config
+
+    def __getattr__(self, name: str) -> Any:
+        if name != "config" or "settings" not in self.__dict__:
+            raise AttributeError(name)
+        self.config = pickle.loads(self.settings)
+        return self.config
+
+
+def _read_once(read: Callable) -> Callable:
+    """A file of settings, or None where there is none."""
+    known: dict[str, _Read | None] = {}
+
+    def called(self, config_path):
+        if not _ours(self.sources):
+            return read(self, config_path=config_path)
+        if config_path not in known:
+            found = read(self, config_path=config_path)
+            known[config_path] = None if found is None else _Read(found)
+        return copy.copy(known[config_path])
+
+    return called
 
 
 def _once(function: Callable, about: Callable) -> Callable:
@@ -81,7 +119,7 @@ def _once(function: Callable, about: Callable) -> Callable:
 
     def called(self, **arguments):
         sources, key = about(self, **arguments)
-        if [source.path for source in sources if source.scheme() == "file"] != [CONF]:
+        if not _ours(sources):
             return function(self, **arguments)
         if key not in known:
             known[key] = pickle.dumps(function(self, **arguments))
@@ -90,12 +128,55 @@ def _once(function: Callable, about: Callable) -> Callable:
     return called
 
 
-def _files(self: Any, defaults: Any, repo: Any) -> tuple[Any, str]:
-    return repo.get_sources(), repr([dataclasses.astuple(one) for one in defaults])
-
-
 def _file(self: Any, default: Any, repo: Any) -> tuple[Any, str]:
     return repo.get_sources(), repr(dataclasses.astuple(default))
+
+
+def _merged_once(merge: Callable) -> Callable:
+    """Files merged one after the other: what a list begins with as one before did is not merged again."""
+    known: dict[tuple[str, ...], bytes] = {}  # files -> all of them, merged
+    begun: dict[tuple[str, ...], bytes] = {}  # files at the beginning of lists
+    before: tuple[str, ...] = ()
+
+    def called(self, defaults, repo):
+        nonlocal before
+        if not _ours(repo.get_sources()):
+            return merge(self, defaults=defaults, repo=repo)
+        files = tuple(repr(dataclasses.astuple(one)) for one in defaults)
+        if files in known:
+            return pickle.loads(known[files])
+        start = next((k for k in range(len(files), 0, -1) if files[:k] in begun), 0)
+        shared = next((k for k, (one, other) in enumerate(zip(files, before, strict=False)) if one != other), 0)
+        before = files
+        config = pickle.loads(begun[files[:start]]) if start else OmegaConf.create()
+        try:
+            with flag_override(config, "no_deepcopy_set_nodes", True):
+                for k, default in enumerate(defaults[start:], start):
+                    if k == shared > start:
+                        with flag_override(config, "no_deepcopy_set_nodes", None):
+                            begun[files[:k]] = pickle.dumps(config)
+                    config.merge_with(self._load_single_config(default=default, repo=repo).config)
+        except OmegaConfBaseException:
+            return merge(self, defaults=defaults, repo=repo)  # which names the file
+        _without_defaults(config)
+        known[files] = pickle.dumps(config)
+        return config
+
+    return called
+
+
+def _without_defaults(config: Any) -> None:
+    """Takes lists of defaults away, as Hydra does when all is merged."""
+    if config._is_missing() or config._is_none():
+        return
+    if config._get_flag("HYDRA_REMOVE_TOP_LEVEL_DEFAULTS"):
+        with flag_override(config, ["readonly", "struct"], False):
+            config._set_flag("HYDRA_REMOVE_TOP_LEVEL_DEFAULTS", None)
+            config.pop("defaults", None)
+    content = config.__dict__["_content"]
+    for value in content.values() if isinstance(content, dict) else ():
+        if isinstance(value, DictConfig):
+            _without_defaults(value)
 
 
 def _listed_once(listed: Callable) -> Callable:
@@ -106,7 +187,7 @@ def _listed_once(listed: Callable) -> Callable:
         chosen = defaults_list.Overrides(repo, overrides_list)
         about = chosen.override_choices, chosen.append_group_defaults, chosen.deletions
         key = repr((config_name, about, prepend_hydra, skip_missing))
-        if [source.path for source in repo.get_sources() if source.scheme() == "file"] != [CONF]:
+        if not _ours(repo.get_sources()):
             return listed(repo, config_name, overrides_list, prepend_hydra, skip_missing)
         if key not in known:
             known[key] = listed(repo, config_name, overrides_list, prepend_hydra, skip_missing)
@@ -131,8 +212,11 @@ def _where_needed(map_of: Callable) -> Callable:
     """A map of all choices, which Hydra makes for each of some thirty files and reads only where a default depends on another."""
 
     def choices(overrides, defaults, self_added):
-        depends = any(not one.is_self() and not one.is_override() and one.is_interpolation() for one in defaults)
-        return map_of(overrides, defaults, self_added) if depends else None
+        depends = [str(one.get_name()) for one in defaults if not one.is_self() and not one.is_override()]
+        depends = [name for name in depends if "${" in name]
+        if any("defaults" in name for name in depends):  # by its place in a list
+            return map_of(overrides, defaults, self_added)
+        return OmegaConf.create(overrides.known_choices) if depends else None
 
     return choices
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from heatsplat.datamodules.synthetic_scene.heat import Material, Responses, Waveform, solve
+from heatsplat.datamodules.synthetic_scene.heat import Material, Responses, Waveform, solved
 from heatsplat.datamodules.synthetic_scene.shapes import Point, Shape, Sphere, dot, trace
 from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN
 
@@ -73,7 +73,7 @@ class Carried:
         """How materials answer to a flux that rises to 1 W/m² within an interval and falls back within the next."""
         step = self.interval_s(duration_s)
         hat = Waveform((0.0, step, 2.0 * step), (0.0, 1.0, 0.0))
-        return solve(materials, hat, duration_s + 2.0 * step)
+        return solved(tuple(materials), hat, duration_s + 2.0 * step)
 
     def rises(self, responses: Responses, times_s: np.ndarray, duration_s: float) -> np.ndarray:
         """Warming [F, K, m] of m materials at ``times_s`` [F] by 1 W/m² at each station, of ``responses``, in K/(W/m²)."""

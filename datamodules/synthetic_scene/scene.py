@@ -80,7 +80,7 @@ class Scene:
         self.emissivity = torch.tensor([*(surface.emissivity for surface in preset.surfaces), 1.0], dtype=torch.float64)
         self.materials = list(dict.fromkeys(surface.material for surface in preset.surfaces))
         waveform = preset.lamp.waveform if preset.lamp else heat.CONSTANT
-        self.responses = heat.solve(self.materials, waveform, preset.duration_s)
+        self.responses = heat.solved(tuple(self.materials), waveform, preset.duration_s)
         self.carried_responses = preset.carried and preset.carried.responses(self.materials, preset.duration_s)
         if preset.bounds_c is not None:
             self.thermal_range = ThermalRange(*preset.bounds_c)
@@ -104,8 +104,8 @@ class Scene:
         """Outward unit normals [n, 3] at ``points`` [n, 3] on the surfaces numbered ``which`` [n]; 0 where there is none."""
         result = torch.zeros_like(points)
         for number, shape in enumerate(self.shapes):
-            here = which == number
-            if here.any():
+            here = (which == number).nonzero()[:, 0]
+            if len(here):
                 result[here] = shape.normals(points[here])
         return result
 
@@ -117,9 +117,10 @@ class Scene:
             torch.full((len(points),), -1),
             *((points.new_zeros(len(points), 3), points.new_zeros(len(points), 3)) if self.preset.diffusivity else ()),
         )
+        normals, reaching = torch.zeros_like(points), torch.zeros_like(result.flux_w_m2)
         for number, surface in enumerate(self.preset.surfaces):
-            here = which == number
-            if not here.any():
+            here = (which == number).nonzero()[:, 0]
+            if not len(here):
                 continue
             on = points[here]
             local = surface.shape.local(on)
@@ -134,8 +135,14 @@ class Scene:
             if self.preset.held:
                 result.flux_w_m2[here] = surface.material.exchange * result.start_k[here]
             if self.preset.lamp:
-                lit = self._lamp_flux(on, surface.shape.normals(on))
-                result.flux_w_m2[here] = surface.absorbs(local).clamp(0.0, 1.0) * lit
+                facing = surface.shape.normals(on)
+                normals[here], reaching[here] = facing, self._lamp_flux(on, facing)
+                result.flux_w_m2[here] = surface.absorbs(local).clamp(0.0, 1.0) * reaching[here]
+        if self.preset.lamp:  # one look for shadows from all surfaces
+            lit = (reaching > 0).nonzero()[:, 0]
+            to_lamp = points.new_tensor(self.preset.lamp.position) - points[lit]
+            blocked, _ = trace(self.shapes, points[lit] + _OFF_SURFACE_M * normals[lit], to_lamp)
+            result.flux_w_m2[lit[blocked < 1.0]] = 0.0
         if self.preset.carried is None:
             return result
         there = which >= 0
@@ -145,7 +152,7 @@ class Scene:
         return replace(result, carried_w_m2=fluxes)
 
     def _lamp_flux(self, points: Tensor, normals: Tensor) -> Tensor:
-        """Flux [n] that the lamp at full level sends onto ``points`` [n, 3], shadows included, in W/m²."""
+        """Flux [n] that the lamp at full level sends onto ``points`` [n, 3] if nothing stands between, in W/m²."""
         lamp = self.preset.lamp
         position, aim = points.new_tensor(lamp.position), points.new_tensor(lamp.aim)
         to_lamp = position - points
@@ -155,11 +162,7 @@ class Scene:
         off_axis = torch.acos((-(to_lamp @ axis) / (distance * axis.norm())).clamp(-1.0, 1.0))
         edge = math.radians(lamp.half_angle_deg)
         beam = torch.sigmoid((edge - off_axis) / (0.1 * edge))
-        flux = lamp.flux_w_m2 * (axis.norm() / distance) ** 2 * facing.clamp_min(0.0) * beam
-        lit = flux > 0
-        blocked, _ = trace(self.shapes, points[lit] + _OFF_SURFACE_M * normals[lit], to_lamp[lit])
-        flux[lit] = torch.where(blocked < 1.0, 0.0, flux[lit])
-        return flux
+        return lamp.flux_w_m2 * (axis.norm() / distance) ** 2 * facing.clamp_min(0.0) * beam
 
     def celsius(self, surface: SurfaceHeat, times_s: Tensor) -> Tensor:
         """Temperatures [n, F] of surface points at ``times_s`` [F], in °C; ambient where there is no surface."""
@@ -279,8 +282,8 @@ class Scene:
         """Colour [n, 3] in [0, 1] that surface points reflect: Lambertian, dark where the paint absorbs heat."""
         color = torch.zeros_like(points)
         for number, surface in enumerate(self.preset.surfaces):
-            here = which == number
-            if not here.any():
+            here = (which == number).nonzero()[:, 0]
+            if not len(here):
                 continue
             on = points[here]
             daylight = _SKYLIGHT + (1 - _SKYLIGHT) * (surface.shape.normals(on) @ on.new_tensor(_SUN)).clamp_min(0.0)

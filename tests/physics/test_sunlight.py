@@ -1,6 +1,7 @@
 """Sunlight on oriented surfaces: the sum of the last hours and the tables of what came before."""
 
 import math
+from functools import cache
 
 import pytest
 import torch
@@ -11,7 +12,11 @@ from heatsplat.training.rng import generator_for
 from tests.physics.weather_reference import drivers
 
 RECORD = drivers(days=3.0)
-TABLE = SunlightTable(RECORD.times_s, RECORD.beams)
+
+
+@cache
+def table() -> SunlightTable:
+    return SunlightTable(RECORD.times_s, RECORD.beams)
 
 
 def surfaces(count: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -30,7 +35,7 @@ def test_responses_are_those_of_the_whole_record():
         decay, before, after = step_weights(log_rates.exp(), 600.0)
         response = decay * response + before * lit[:, k] + after * lit[:, k + 1]
         if k % 23 == 0:
-            errors.append(TABLE.response(float(RECORD.times_s[k + 1]), normals, log_rates) - response)
+            errors.append(table().response(float(RECORD.times_s[k + 1]), normals, log_rates) - response)
     errors_mk = 60_000 * torch.stack(errors).abs()  # of surfaces that the beam heats by 60 K
     assert errors_mk.square().mean().sqrt() < 0.4
     assert errors_mk.flatten().quantile(0.999) < 4
@@ -47,7 +52,7 @@ def test_the_first_day_is_exact_between_samples_too():
     decay, before, after = step_weights(log_rates.exp(), 210.0)
     end = torch.lerp(lit[:, 60], lit[:, 61], 0.35)
     truth = decay * response + before * lit[:, 60] + after * end
-    torch.testing.assert_close(TABLE.response(60 * 600.0 + 210.0, normals, log_rates), truth, atol=1e-10, rtol=0)
+    torch.testing.assert_close(table().response(60 * 600.0 + 210.0, normals, log_rates), truth, atol=1e-10, rtol=0)
 
 
 def test_night_is_exactly_zero():
@@ -62,7 +67,7 @@ def test_derivatives_are_those_of_the_values():
     normals, log_rates = (x.requires_grad_() for x in surfaces(30))
 
     def response(normals, log_rates):
-        return TABLE.response(0.7 * 86400, normals, log_rates)  # later tables are float32
+        return table().response(0.7 * 86400, normals, log_rates)  # later tables are float32
 
     assert torch.autograd.gradcheck(response, (normals, log_rates), eps=1e-6, atol=1e-6)
 
@@ -70,4 +75,4 @@ def test_derivatives_are_those_of_the_values():
 def test_mean_light_of_level_surfaces_is_that_of_the_record():
     level = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     truth = torch.trapezoid(RECORD.beams[:, 2].clamp(min=0), RECORD.times_s) / (3 * 86400)
-    assert TABLE.mean(level).item() == pytest.approx(truth.item(), rel=1e-3)
+    assert table().mean(level).item() == pytest.approx(truth.item(), rel=1e-3)
