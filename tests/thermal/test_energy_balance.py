@@ -435,6 +435,30 @@ def test_an_exchange_by_convention_is_not_learned():
         ready(scene(weather(wind_m_s=None)), exchange="iso_6946")
 
 
+@pytest.mark.parametrize("exchange", ["iso_6946", [5.0, 2.5]])
+def test_where_the_exchange_is_given_nothing_absorbs_more_light_than_falls_on_it(exchange):
+    model, splats = ready(exchange=exchange, emissivity=0.9)
+    told = model.attributes(splats, Query(time_s=0.0))["absorptivity"]
+    assert (told > 0).all() and (told <= 0.5001).all()  # where training starts
+    learned, of_learned = ready(emissivity=0.9)
+    assert (learned.attributes(of_learned, Query(time_s=0.0))["absorptivity"] > 0.5).any()
+    with torch.no_grad():
+        splats["raw_sun"].fill_(50.0)
+    black = model.attributes(splats, Query(time_s=0.0))["absorptivity"]
+    torch.testing.assert_close(black, torch.ones(6), rtol=1e-5, atol=0)
+
+
+def test_checkpoints_of_before_that_limit_show_what_they_did():
+    model, splats = ready(exchange="iso_6946")
+    before = model.state_dict()
+    del before["sun_limit"]
+    old, _ = ready(exchange="iso_6946")
+    old.load_state_dict(before)
+    sun = old.attributes(splats, Query(time_s=0.0))["sun_k_per_kw_m2"]
+    torch.testing.assert_close(sun, 200.0 * splats["raw_sun"].detach().sigmoid())
+    assert model.sun_limit < 100.0 and "sun_limit" not in EnergyBalance().state_dict()
+
+
 def test_a_record_of_still_air_has_the_convection_of_still_air():
     still = torch.zeros_like(weather().wind_m_s)
     for exchange, expected in (("iso_6946", 4.0), ([5.0, 2.5], 5.0)):

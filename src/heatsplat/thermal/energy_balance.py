@@ -37,6 +37,7 @@ from heatsplat.thermal.coordinates import ImageRange
 from heatsplat.thermal.surface_drivers import drivers_of
 
 SUN_LIMIT = 200.0  # K m²/kW: a black surface at 8 °C that loses heat by its own radiation alone
+HALF = 0.5  # of the light that falls on it is what a surface absorbs that no image tells more of
 SHARE_LIMITS = (0.02, 0.98)  # of radiation in the exchange: where attributes divide by it or by the rest
 WIND_LIMITS = (0.0, 0.95)  # of wind in convection: in a calm something is left
 START_SHARE, START_WIND = 0.4, 0.4  # e = 0.9 beside 8 W/(m² K), of which a light breeze makes 40 %
@@ -81,11 +82,11 @@ class EnergyBalance(ThermalModel):
     **Convention:** the record's first sample is the start. In another weather (a scene whose record is another) surfaces
     start from the state that they had at the start of the trained record, whenever the other one starts.
 
-    Tensors, [N] each: "initial_state" in image units; "log_rate", log of 1/s; "raw_sun", logit of α/H by 200 K m²/kW;
-    "raw_share", logit of e's share of H; "raw_wind", logit of wind's share of convection; with two nodes "initial_core" in
-    image units, "log_core_rate", log of 1/s, and "log_coupling", of the conductance to the core over H; with heat from within
-    "inner_rise", q/H in image units. With solution "corrected" a constant, "marched_at" [N, Q], the parameters at which a
-    Gaussian was last marched.
+    Tensors, [N] each: "initial_state" in image units; "log_rate", log of 1/s; "raw_sun", logit of α/H by 200 K m²/kW, or of α
+    where the exchange is given; "raw_share", logit of e's share of H; "raw_wind", logit of wind's share of convection; with two
+    nodes "initial_core" in image units, "log_core_rate", log of 1/s, and "log_coupling", of the conductance to the core over H;
+    with heat from within "inner_rise", q/H in image units. With solution "corrected" a constant, "marched_at" [N, Q], the
+    parameters at which a Gaussian was last marched.
 
     Args:
         solution: "corrected" solves the full balance along the record, for all training frames at once and anew where
@@ -193,6 +194,8 @@ class EnergyBalance(ThermalModel):
         self.register_buffer("reference_k", torch.zeros((), dtype=torch.float64))
         if self.options.windy:
             self.register_buffer("mean_wind", torch.zeros((), dtype=torch.float64))
+        if self._exchange_given:
+            self.register_buffer("sun_limit", torch.zeros((), dtype=torch.float64))
         if self.options.shadows:
             self.register_buffer("sun_ways", torch.zeros(0, 3, dtype=torch.float64))  # those of SUN_SEEN's columns
         self._weather: Weather | None = None
@@ -212,6 +215,8 @@ class EnergyBalance(ThermalModel):
             self.reference_k.fill_(kelvin(driver_means(weather.times_s, weather.air_c)))
             if self.options.windy and weather.wind_m_s is not None:
                 self.mean_wind.copy_(driver_means(weather.times_s, weather.wind_m_s))
+            if self._exchange_given:
+                self.sun_limit.fill_(1000.0 * self._shares()[0] / self._radiation())
         self._moments = torch.tensor(sorted(set(scene.train.times_s) - {None}), dtype=torch.float64)
         self.under(weather)
         for frame in scene.frames:
@@ -251,14 +256,14 @@ class EnergyBalance(ThermalModel):
         # prior holds them together at any pace.
         share = partial(tensor, paced=self.options.linear or self.share_prior > 0)
         if self._sunlit:
-            tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / SUN_LIMIT), self.lr_sun)
-        if drivers.sky is not None and self.options.convection is None:
+            tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / self._sun_limit), self.lr_sun)
+        if drivers.sky is not None and not self._exchange_given:
             start = (START_SHARE - SHARE_LIMITS[0]) / (SHARE_LIMITS[1] - SHARE_LIMITS[0])
             tensors["raw_share"] = share(torch.full_like(grey, start).logit(), self.lr_share)
-        if drivers.wind_anomaly is not None and self.options.convection is None:
+        if drivers.wind_anomaly is not None and not self._exchange_given:
             tensors["raw_wind"] = share(torch.full_like(grey, START_WIND / WIND_LIMITS[1]).logit(), self.lr_wind)
         if not self.options.linear:
-            shares_given = 0 if self.options.convection is None else 1 + self.options.windy
+            shares_given = 1 + self.options.windy if self._exchange_given else 0
             numbers = len(tensors) + shares_given
             tensors[MARCHED_AT] = PerGaussian(grey.new_zeros(len(grey), numbers), 0.0)  # at none that there is
         if drivers.up is None:
@@ -311,7 +316,7 @@ class EnergyBalance(ThermalModel):
             sample, _ = interval_of(self.climate.drivers.times_s, query.time_s)
             values["sunlit"] = surface.exposure.sun[:, self.climate.slots[sample]]
         if surface.share is not None:
-            exchange = 4 * self.options.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3 / surface.share
+            exchange = self._radiation() / surface.share
             values["radiation_share"] = surface.share
             values["convection_w_m2_k"] = exchange * (1 - surface.share)
             if self.options.semi_infinite:
@@ -333,7 +338,7 @@ class EnergyBalance(ThermalModel):
 
     def doubts(self) -> dict[str, Callable[[], AbstractContextManager[None]]]:
         """Convection that is given, which is known to ``convection_error``."""
-        given = self.options.convection is not None and self.options.convection_error > 0
+        given = self._exchange_given and self.options.convection_error > 0
         return {"convection": self._more_convection} if given else {}
 
     @contextmanager
@@ -401,7 +406,7 @@ class EnergyBalance(ThermalModel):
 
         drivers = self.climate.drivers
         log_rate = query.rows(splats["log_rate"]).clamp(*LOG_RATES)
-        if self.options.convection is None:
+        if not self._exchange_given:
             share = bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None
             wind = bounded("raw_wind", *WIND_LIMITS) if drivers.wind_anomaly is not None else None
         else:
@@ -410,7 +415,7 @@ class EnergyBalance(ThermalModel):
         return Surface(
             start=state("initial_state"),
             log_rate=log_rate,
-            sun=bounded("raw_sun", 0.0, SUN_LIMIT) if self._sunlit else None,
+            sun=bounded("raw_sun", 0.0, self._sun_limit) if self._sunlit else None,
             share=share,
             wind=wind,
             normals=query.normals(splats) if drivers.up is not None else None,
@@ -424,8 +429,21 @@ class EnergyBalance(ThermalModel):
         still, per_wind = self.options.convection
         windy = per_wind * self.mean_wind.item() if self.options.windy else 0.0
         convection = (still + windy) * self._convection_factor
-        radiation = 4 * self.options.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3
+        radiation = self._radiation()
         return radiation / (radiation + convection), windy / (still + windy)
+
+    def _radiation(self) -> float:
+        """What a surface loses by radiation for each kelvin that it is warmer, in W/(m² K)."""
+        return 4 * self.options.emissivity * STEFAN_BOLTZMANN * self.reference_k.item() ** 3
+
+    @property
+    def _exchange_given(self) -> bool:
+        return self.options.convection is not None
+
+    @property
+    def _sun_limit(self) -> float:
+        """Heating by the sun in K m²/kW of which surfaces have a share: where their exchange is given, that of a black one."""
+        return self.sun_limit.item() if self._exchange_given else SUN_LIMIT
 
     def _first_sun(self, grey: Tensor) -> Tensor:
         """Heating by the sun, [N] in K m²/kW, at which level surfaces have the mean temperatures that images show."""
@@ -436,12 +454,18 @@ class EnergyBalance(ThermalModel):
         loss = (1 - share) * (excess - mean(drivers.air))
         if share:
             loss = loss + share * (power_excess(excess, drivers.reference_k) - mean(drivers.sky))
-        return (loss / mean(light).clamp(min=1e-6)).clamp(*START_SUN).to(grey)
+        low, high = START_SUN
+        if self._exchange_given:  # what heat from within does is not in this balance, and would count for the sun
+            high = min(high, HALF * self._sun_limit)
+        return (loss / mean(light).clamp(min=1e-6)).clamp(low, high).to(grey)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest) -> None:
-        """Checkpoints of before shadows kept their directions have those of their weather; what torch does follows."""
+        """Checkpoints of before shadows kept their directions have those of their weather, and those of before the sun's limit
+        followed from the exchange have the limit of all; what torch does follows."""
         if self.options.shadows:
             state_dict.setdefault(prefix + "sun_ways", self.sun_ways)
+        if self._exchange_given:
+            state_dict.setdefault(prefix + "sun_limit", torch.full_like(self.sun_limit, SUN_LIMIT))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
