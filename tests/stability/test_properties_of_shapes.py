@@ -36,7 +36,8 @@ def test_a_quaternion_of_any_length_is_a_rotation(dtype, seed, length):
     quats = (directions(seed, 4) * length).to(dtype).requires_grad_()
     matrix = quats_to_matrices(quats)
     eps = torch.finfo(dtype).eps
-    torch.testing.assert_close(matrix @ matrix.mT, torch.eye(3, dtype=dtype), rtol=0, atol=8 * eps)
+    # Of two million rotations the worst is off by 11 eps, and one in four thousand by more than 8.
+    torch.testing.assert_close(matrix @ matrix.mT, torch.eye(3, dtype=dtype), rtol=0, atol=16 * eps)
     matrix.sum().backward()
     assert quats.grad.isfinite().all()
     # A longer quaternion turns as much: the gradient has no part along it.
