@@ -132,11 +132,12 @@ def learned_section(folder: Path) -> list[str]:
 
 
 EFFECTS_NOTE = (
-    "An effect is simulated if its statistic exceeds the threshold and the images can show it. There is no number if the effect "
-    "was set by hand or the data are not sufficient. dB: gain on held-out observations. An effect that is off is absent: no "
-    "parameter, no operation. Parameters: of the Gaussians at the end. ms per step: difference of whole training steps on the "
-    "initial Gaussians with all effects and without this one (and those that depend on it), alternating, fastest of each; a few "
-    "hundredths are noise."
+    "An effect is simulated if its statistic exceeds the threshold: then the fit of all effects selects it. Where the "
+    "reason says that it cannot be told, held-out observations do not bear that out, or something else would explain them "
+    "as well. There is no number if the effect was set by hand or the data are not sufficient. dB: gain on held-out "
+    "observations. An effect that is off is absent: no parameter, no operation. Parameters: of the Gaussians at the end. ms "
+    "per step: difference of whole training steps on the initial Gaussians with all effects and without this one (and those "
+    "that depend on it), alternating, fastest of each; a few hundredths are noise."
 )
 
 
