@@ -8,6 +8,7 @@ import inspect
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -220,6 +221,30 @@ def test_bad_input_is_named_with_exit_code_one(overrides, message, tmp_path, tol
 def test_help_lists_the_choices(tmp_path, told):
     output = told("train", "method=etgs", "--help", cwd=tmp_path)
     assert "etgs" in output and "colmap" in output
+
+
+def test_help_says_what_methods_and_studies_are_and_leaves_out_what_is_internal(tmp_path, told):
+    train = told("train", "--help", cwd=tmp_path)
+    assert re.search(r"^  3dgs +3D Gaussian Splatting", train, re.MULTILINE)
+    assert "max_steps: 30000" in train and "# training steps" in train and "  renderer: auto, cpu, gsplat" in train
+    assert "_target_" not in train and "override" not in train and "optional" not in train and "hydra.run" not in train
+    assert not re.search(r"@package|^module:|^hydra:|python src/\S+ study=", train, re.MULTILINE)
+    study = told("study", "-h", cwd=tmp_path)
+    assert re.search(r"^  steps +Times whole training steps part by part", study, re.MULTILINE)
+    for options in re.findall(r"^(?:method|data|preset):\n((?:  .+\n)+)", train, re.MULTILINE):
+        assert all(len(line.split()) > 3 for line in options.splitlines())
+
+
+def test_help_of_other_commands_explains_each_of_their_settings(tmp_path, told):
+    for command, says in {
+        "render": "frames: 60         # number of images (orbit, path, view)",
+        "export": "  above: null      # [x, y, z] direction in the world from which the map is seen",
+        "simplify": "  share: 0.2                 # of the Gaussians merged",
+        "evaluate": "  only: null     # a surface of a synthetic scene",
+        "view": "training_cameras: 36 # those in the page",
+    }.items():
+        shown = told(command, "--help", cwd=tmp_path)
+        assert says in shown and "hydra" not in shown and "\n\n\n" not in shown, command
 
 
 def test_help_of_preparation_lists_its_own_settings_with_their_units(tmp_path, told):
