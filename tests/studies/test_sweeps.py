@@ -17,7 +17,7 @@ from heatsplat.io.results import FAILED, METRICS_FILE
 from heatsplat.runs.resume import NOT_LEARNED
 from heatsplat.studies.finished import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, read_runs, row_names, settings_of
 from heatsplat.studies.published.figures import quoted
-from heatsplat.studies.sweeps import collect, write_sweep
+from heatsplat.studies.sweeps import collect, markdown, picture, write_sweep
 from hydra_plugins.heatsplat_sweeper.rows import folder_name
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,6 +67,19 @@ def test_the_table_is_written_for_people_programs_and_eyes(sweep):
         and rows[1]["paper_psnr"] == ""
         and rows[2]["failed"] == "1"
     )
+
+
+def test_scores_of_different_scenes_stand_in_panels_of_their_own(tmp_path):
+    for number, (method, scene) in enumerate([("etgs", "cooling"), ("3dgs", "static")]):
+        job(tmp_path, number, [f"method={method}", f"data.scene={scene}"], 30.0 + number, scene=scene)
+    assert "No two rows are of one scene" in markdown(collect(tmp_path), {})
+    job(tmp_path, 2, ["method=3dgs", "data.scene=cooling"], 33.0, scene="cooling")
+    rows = collect(tmp_path)
+    assert "No two rows" not in markdown(rows, {})
+    panels = picture(rows).axes
+    assert [axes.get_title() for axes in panels] == ["cooling", "cooling", "static", "static"]
+    labels = [axes.get_legend_handles_labels()[1] for axes in panels]
+    assert [len(each) for each in labels] == [2, 2, 1, 1]
 
 
 def test_a_folder_without_jobs_has_no_table(tmp_path):

@@ -114,6 +114,10 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
     jobs = [set(settings_of(overrides)) for row in rows for overrides in row.table["overrides"]]
     shared = sorted(set.intersection(*jobs))
     about = "Mean ± standard deviation over seeds." + (f" {all_rows(shared)}" if shared else "")
+    if len(rows) > 1 and len({row.scene for row in rows}) == len(rows):
+        about += (
+            " No two rows are of one scene, so their scores are not to be compared: a scene for all is data.scene=NAME."
+        )
     return "\n".join([f"# Sweep on {scenes}", "", about, "", *lines, ""])
 
 
@@ -130,25 +134,28 @@ def _records(rows: Sequence[Runs], paper: Printed) -> list[dict[str, Any]]:
 
 
 def picture(rows: Sequence[Runs]) -> Figure | None:
-    """PSNR and MAE against seconds of training, a mark per row with its spread; None without such values."""
+    """PSNR and MAE against seconds of training, a mark per row with its spread and a line of panels per scene, for scores of
+    different scenes are not compared; None without such values."""
     shown = [name for name in ("psnr", "mae_c") if any(row.mean(name) is not None for row in rows)]
     if not shown or not any(row.mean("train_seconds") for row in rows):
         return None
-    several = len({row.scene for row in rows}) > 1
-    figure = Figure(figsize=(5.2 * len(shown), 4.2), dpi=110, layout="constrained")
-    for i, name in enumerate(shown):
-        axes = figure.add_subplot(1, len(shown), i + 1)
-        for j, row in enumerate(rows):
-            x, y = row.mean("train_seconds"), row.mean(name)
-            if x is not None and y is not None:
-                label = literal(f"{row.label}, {row.scene}" if several else row.label)
-                color, mark = series_look(j)
-                axes.errorbar(
-                    x, y, row.spread(name) or 0, row.spread("train_seconds") or 0, mark, color=color, capsize=2, markersize=6,
-                    label=label,
-                )  # fmt: skip
-        axes.set(xlabel="seconds of training", ylabel=f"{described(name).heading}, test")
-        axes.grid(alpha=0.25)
-        if i == 0:
-            axes.legend(fontsize=7)
+    scenes = list(dict.fromkeys(row.scene for row in rows))
+    figure = Figure(figsize=(5.2 * len(shown), 4.2 * len(scenes)), dpi=110, layout="constrained")
+    panels = figure.subplots(len(scenes), len(shown), squeeze=False)
+    for line, scene in zip(panels, scenes, strict=True):
+        for axes, name in zip(line, shown, strict=True):
+            for j, row in enumerate(row for row in rows if row.scene == scene):
+                x, y = row.mean("train_seconds"), row.mean(name)
+                if x is not None and y is not None:
+                    color, mark = series_look(j)
+                    axes.errorbar(
+                        x, y, row.spread(name) or 0, row.spread("train_seconds") or 0, mark, color=color, capsize=2, markersize=6,
+                        label=literal(row.label),
+                    )  # fmt: skip
+            axes.set(xlabel="seconds of training", ylabel=f"{described(name).heading}, test")
+            axes.grid(alpha=0.25)
+            if len(scenes) > 1:
+                axes.set_title(literal(scene), fontsize=9)
+        if line[0].get_legend_handles_labels()[0]:
+            line[0].legend(fontsize=7)
     return figure
