@@ -139,15 +139,15 @@ def picture(rows: Sequence[Runs]) -> Figure | None:
     shown = [name for name in ("psnr", "mae_c") if any(row.mean(name) is not None for row in rows)]
     if not shown or not any(row.mean("train_seconds") for row in rows):
         return None
-    scenes = list(dict.fromkeys(row.scene for row in rows))
+    scenes, labels = list(dict.fromkeys(row.scene for row in rows)), list(dict.fromkeys(row.label for row in rows))
     figure = Figure(figsize=(5.2 * len(shown), 4.2 * len(scenes)), dpi=110, layout="constrained")
     panels = figure.subplots(len(scenes), len(shown), squeeze=False)
     for line, scene in zip(panels, scenes, strict=True):
         for axes, name in zip(line, shown, strict=True):
-            for j, row in enumerate(row for row in rows if row.scene == scene):
+            for row in (row for row in rows if row.scene == scene):
                 x, y = row.mean("train_seconds"), row.mean(name)
                 if x is not None and y is not None:
-                    color, mark = series_look(j)
+                    color, mark = series_look(labels.index(row.label))
                     axes.errorbar(
                         x, y, row.spread(name) or 0, row.spread("train_seconds") or 0, mark, color=color, capsize=2, markersize=6,
                         label=literal(row.label),
