@@ -26,6 +26,26 @@ def test_temperatures_that_are_kelvin_or_of_another_scale_are_found():
         assert "bounds" not in checks(replace(clean(), images=celsius, unit_k=1.0, bounds_c=None), only="bounds")
 
 
+def test_bounds_that_cut_off_are_not_to_be_narrowed():
+    found = findings_of(changed(clean(), 0.02 * clean().images, clipped=0.9), "bounds")
+    assert [one.remedy.split()[1] for one in found] == ["wider"]
+
+
+def test_bounds_that_heatsplat_chose_are_named_so_and_blame_no_camera():
+    top = float(clean().images.quantile(0.97))
+    at_bound = changed(clean(), (clean().images / top).clamp(max=1.0), clipped=0.004)
+    (given,) = findings_of(at_bound, "bounds")
+    assert given.check == "bounds" and "upper bound" in given.what and "wider" in given.remedy
+    assert findings_of(replace(at_bound, bounds_chosen=True), "bounds") == []
+    (cut,) = findings_of(replace(at_bound, bounds_chosen=True, clipped=0.03), "bounds")
+    assert "which heatsplat took from the training images" in cut.what and "same export" not in cut.remedy
+    narrow = replace(clean(), images=0.1 * clean().images, bounds_c=(0.0, 500.0), clipped=0.0, bounds_chosen=True)
+    (unused,) = findings_of(narrow, "bounds")
+    assert "99.8 % of the pixels lie within" in unused.what and "masks/" in unused.remedy
+    saturated = changed(clean(), 0.9 * (clean().images / top).clamp(max=1.0), clipped=0.0, bounds_chosen=True)
+    assert "saturation" in checks(saturated, only="bounds")
+
+
 def test_saturation_is_found():
     assert "saturation" in checks(
         changed(clean(), clean().images.clamp(max=float(clean().images.quantile(0.97))), clipped=0.0), only="bounds"

@@ -65,6 +65,7 @@ class Material:
         all_cameras: of all training frames, or None.
         points: [P, 3] of the scene, or None where there are none but random ones.
         bounds_c: temperatures of image values 0 and 1, or None.
+        bounds_chosen: whether heatsplat took these bounds from the training images, as nobody gave any.
         clipped: share of pixels that lay outside the bounds, or None where unknown.
         answers: [F, k] how surfaces answer recorded weather in the frames of ``images``; None without a record.
         lenses: for every frame, the number of the camera that took it; empty where one took all.
@@ -83,6 +84,7 @@ class Material:
     all_cameras: Sequence[Camera] | None = None
     points: Tensor | None = None
     bounds_c: tuple[float, float] | None = None
+    bounds_chosen: bool = False
     clipped: float | None = None
     answers: Tensor | None = None
     lenses: Sequence[int] = ()
@@ -206,6 +208,7 @@ def material_of(scene: SceneData) -> Material:
         all_cameras=[frame.camera for frame in frames],
         points=points,
         bounds_c=None if bounds is None else (bounds.min_c, bounds.max_c),
+        bounds_chosen="training_images_c" in scene.notes,
         clipped=scene.notes.get("clipped_fraction"),
         answers=drivers(scene.weather, seen_s, air=(QUICK_PER_S, SLOW_PER_S)),
         lenses=_lenses(frames),

@@ -12,60 +12,82 @@ NARROW = 0.15  # of the range that pixels use
 EARTHLY_C = (-60.0, 650.0)  # what cameras measure without a special range
 KELVIN_C = (200.0, 400.0)  # "°C" between which a whole scene is rather one of -73 .. 127 °C in kelvin
 PLATEAU = 0.004  # share of an image's pixels at exactly its largest value
+WIDER = "Give wider bounds (data.bounds_c, temperature_bounds.json), from the same export as the images."
 MIN_PLATEAU = 8  # pixels: one always is the largest, and in a small image it is a large share
 
 
 def find(material: Material) -> list[Finding]:
-    found = []
-    sampled, plateaus = [], []
+    sampled, plateaus, at_bound = [], [], []
     for f in range(len(material.images)):
         known = material.known(f)
         sampled.append(known[::7].float())  # a slice would hold the whole image
+        # What lies beyond bounds that heatsplat chose is a dead pixel or a hotter held-out image, and saturates nothing.
+        known = known[known < 1] if material.bounds_chosen else known
         plateaus.append(_plateau(known))
+        at_bound.append(bool(material.clipped) and len(known) > 0 and float(known.max()) >= 1)
     values = torch.cat(sampled)
     if not len(values):
         return []
-    found += _of_unit(material, values)
-    if material.bounds_c is not None:
-        low, high = material.bounds_c
-        clipped = material.clipped
-        if clipped is None:
-            clipped = float(((values <= 0) | (values >= 1)).double().mean())
-        if clipped > CLIPPED:
-            found.append(
-                Finding(
-                    "bounds",
-                    min(1.0, 3.0 * clipped),
-                    f"{100 * clipped:.1f} % of the pixels lie at or beyond the bounds {low:g} .. {high:g} °C and are cut off.",
-                    "Give wider bounds (data.bounds_c, temperature_bounds.json), from the same export as the images.",
-                )
-            )
-        ends = values.new_tensor([0.001, 0.999])
-        used = float(values.quantile(ends).diff()) if len(values) < 1 << 24 else 1.0
-        if used < NARROW:
-            found.append(
-                Finding(
-                    "bounds",
-                    0.05,
-                    f"The images use {100 * used:.0f} % of the bounds {low:g} .. {high:g} °C.",
-                    "Narrow the bounds to what the scene shows: losses and 8-bit greys spend the rest on nothing.",
-                )
-            )
+    found = _of_unit(material, values)
+    cut_off = _cut_off(material, values)
+    found += cut_off or _unused(material, values)
     flat = [f for f, share in enumerate(plateaus) if share > PLATEAU]
-    if len(flat) > 0.1 * len(material.images) and not any(
-        one.check == "bounds" and "cut off" in one.what for one in found
-    ):
+    if len(flat) > 0.1 * len(material.images) and not cut_off:
         share = sum(plateaus[f] for f in flat) / len(flat)
-        found.append(
-            Finding(
-                "saturation",
-                min(1.0, 3.0 * share),
-                f"In {len(flat)} of {len(material.images)} frames {100 * share:.1f} % of the pixels have the largest value.",
-                "The detector or the export saturates: record in the high range, or mask what is hotter.",
-                tuple(material.name(f) for f in flat),
-            )
-        )
+        cost, names = min(1.0, 3.0 * share), tuple(material.name(f) for f in flat)
+        where = f"In {len(flat)} of {len(material.images)} frames {100 * share:.1f} % of the pixels"
+        if material.bounds_c is not None and all(at_bound[f] for f in flat):
+            what = f"{where} lie at or beyond the upper bound {material.bounds_c[1]:g} °C and are cut off."
+            found.append(Finding("bounds", cost, what, WIDER, names))
+        else:
+            remedy = "The detector or the export saturates: record in the high range, or mask what is hotter."
+            found.append(Finding("saturation", cost, f"{where} have the largest value.", remedy, names))
     return found
+
+
+def _cut_off(material: Material, values: torch.Tensor) -> list[Finding]:
+    """Pixels beyond the bounds, where they are many."""
+    if material.bounds_c is None:
+        return []
+    clipped = material.clipped
+    if clipped is None:
+        clipped = float(((values <= 0) | (values >= 1)).double().mean())
+    if clipped <= CLIPPED:
+        return []
+    low, high = material.bounds_c
+    what = f"{100 * clipped:.1f} % of the pixels lie at or beyond the bounds {low:g} .. {high:g} °C"
+    remedy = WIDER
+    if material.bounds_chosen:
+        what += ", which heatsplat took from the training images without dead pixels,"
+        remedy = (
+            "Leave dead pixels out with masks/; where held-out images are hotter or colder, give bounds: data.bounds_c "
+            "(data=colmap), temperature_bounds.json."
+        )
+    return [Finding("bounds", min(1.0, 3.0 * clipped), f"{what} and are cut off.", remedy)]
+
+
+def _unused(material: Material, values: torch.Tensor) -> list[Finding]:
+    """Bounds of which images use little."""
+    if material.bounds_c is None or len(values) >= 1 << 24:  # torch takes no quantiles of more
+        return []
+    ends = values.quantile(values.new_tensor([0.001, 0.999]))
+    used = float(ends.diff())
+    if used >= NARROW:
+        return []
+    low, high = material.bounds_c
+    what = f"The images use {100 * used:.0f} % of the bounds {low:g} .. {high:g} °C."
+    remedy = "Narrow the bounds to what the scene shows: losses and 8-bit greys spend the rest on nothing."
+    if material.bounds_chosen:
+        least, most = (low + float(end) * (high - low) for end in ends)
+        what = (
+            f"99.8 % of the pixels lie within {least:.4g} .. {most:.4g} °C, {100 * used:.0f} % of the bounds {low:g} .. "
+            f"{high:g} °C, which heatsplat took from the training images."
+        )
+        remedy = (
+            "If what lies outside is a fault, leave it out with masks/, or give bounds: data.bounds_c (data=colmap), "
+            "temperature_bounds.json. If it is what you look for, leave it."
+        )
+    return [Finding("bounds", 0.05, what, remedy)]
 
 
 def _of_unit(material: Material, values: torch.Tensor) -> list[Finding]:
