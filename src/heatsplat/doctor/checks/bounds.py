@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 
 from heatsplat.doctor.base import Check, Finding, Material
-from heatsplat.physics.units import KELVIN_AT_0_C
+from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, is_centikelvin
 
 CLIPPED = 0.005  # share of pixels beyond the bounds
 NARROW = 0.15  # of the range that pixels use
 EARTHLY_C = (-60.0, 650.0)  # what cameras measure without a special range
 KELVIN_C = (200.0, 400.0)  # "°C" between which a whole scene is rather one of -73 .. 127 °C in kelvin
+FULL_16_BIT = 65535
 PLATEAU = 0.004  # share of an image's pixels at exactly its largest value
 WIDER = "Give wider bounds (data.bounds_c, temperature_bounds.json), from the same export as the images."
 MIN_PLATEAU = 8  # pixels: one always is the largest, and in a small image it is a large share
@@ -28,7 +29,7 @@ def find(material: Material) -> list[Finding]:
     values = torch.cat(sampled)
     if not len(values):
         return []
-    found = _of_unit(material, values)
+    found = _of_unit(material, values) + _counts_as_greys(material, values)
     cut_off = _cut_off(material, values)
     found += cut_off or _unused(material, values)
     flat = [f for f, share in enumerate(plateaus) if share > PLATEAU]
@@ -95,10 +96,7 @@ def _of_unit(material: Material, values: torch.Tensor) -> list[Finding]:
     if material.unit_k is None:
         return []
     low, high = material.bounds_c or (float(values.min()), float(values.max()))
-    remedy = (
-        "Check the unit (°C, kelvin, counts): counts.scale and counts.offset_c of a camera's files, or data.raw_scale and "
-        "data.raw_offset_c."
-    )
+    remedy = _unit_remedy(material)
     if KELVIN_C[0] <= low and high <= KELVIN_C[1]:
         kelvin = f"kelvin of {low - KELVIN_AT_0_C:.4g} .. {high - KELVIN_AT_0_C:.4g} °C"
         what = f"All pixels lie within {low:.4g} .. {high:.4g} °C, which may be {kelvin}."
@@ -109,6 +107,45 @@ def _of_unit(material: Material, values: torch.Tensor) -> list[Finding]:
         shown = f"{low:g} .. {high:g} °C" if low < high else f"{low:.4g} °C (median)"
         return [Finding("bounds", 0.9, f"The images are said to show {shown}.", remedy)]
     return []
+
+
+def _unit_remedy(material: Material) -> str:
+    """What says of which unit the numbers of such files are."""
+    posed = material.cameras is not None
+    if material.stored == "counts" and posed:
+        return "Check the unit: °C = data.raw_scale * count + data.raw_offset_c."
+    if material.stored == "celsius" and posed:
+        return (
+            "Floats are taken for °C. If they are kelvin, make °C of them: python src/prepare.py source=IMAGES target=FOLDER "
+            "counts.offset_c=-273.15 poses=given poses.model=SCENE (with counts.scale, too, if they are counts)."
+        )
+    if material.stored == "radiometric":
+        return "Check the constants of the files: python src/prepare.py takes others as counts.planck=[R1,B,F,O,R2]."
+    if material.stored in ("celsius", "counts"):
+        return "Check the unit: °C = counts.scale * number + counts.offset_c (-273.15 for kelvin)."
+    bounds = "data.bounds_c or temperature_bounds.json" if posed else "bounds_c or temperature_bounds.json"
+    return f"Check the unit of the bounds: {bounds} are the °C of black and white."
+
+
+def _counts_as_greys(material: Material, values: torch.Tensor) -> list[Finding]:
+    """Greys of 16 bits, no temperatures so far, that are rather kelvin x 100."""
+    if material.unit_k is not None or material.stored != "grey16" or len(values) >= 1 << 24:
+        return []
+    ends = values.double().quantile(torch.tensor([0.001, 0.01, 0.5, 0.99, 0.999], dtype=torch.float64)) * FULL_16_BIT
+    least, low, median, high, most = ends.tolist()
+    if most - least >= NARROW * FULL_16_BIT or not is_centikelvin(low, median, high):
+        return []
+    low_c, high_c = (CENTIKELVIN * end - KELVIN_AT_0_C for end in (least, most))
+    return [
+        Finding(
+            "bounds",
+            0.9,
+            f"Greys of 16 bits use {100 * (most - least) / FULL_16_BIT:.1f} % of their range ({least:.0f} .. {most:.0f}) and are "
+            f"no temperatures so far; as kelvin x 100 they would be {low_c:.4g} .. {high_c:.4g} °C.",
+            "If they are: data.raw=images data.raw_scale=0.01 with data=colmap (data.raw is the folder of the images), else "
+            "python src/prepare.py source=IMAGES target=FOLDER poses=given poses.model=SCENE.",
+        )
+    ]
 
 
 def _plateau(values: torch.Tensor) -> float:
