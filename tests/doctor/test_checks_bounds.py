@@ -69,6 +69,10 @@ def test_bounds_that_heatsplat_chose_are_named_so_and_blame_no_camera():
     narrow = replace(clean(), images=0.1 * clean().images, bounds_c=(0.0, 500.0), clipped=0.0, bounds_chosen=True)
     (unused,) = findings_of(narrow, "bounds")
     assert "99.8 % of the pixels lie within" in unused.what and "masks/" in unused.remedy
+    wide = replace(narrow, images=0.02 * clean().images, bounds_c=(0.0, 900.0))  # a single pixel of 900 °C
+    assert len(findings_of(wide, "bounds")) == 1
+    kelvin = replace(narrow, images=0.4 + 0.1 * clean().images, bounds_c=(0.0, 700.0))  # and one of 0 K
+    assert any("may be kelvin" in one.what for one in findings_of(kelvin, "bounds"))
     saturated = changed(clean(), 0.9 * (clean().images / top).clamp(max=1.0), clipped=0.0, bounds_chosen=True)
     assert "saturation" in checks(saturated, only="bounds")
 

@@ -8,9 +8,11 @@ from heatsplat.doctor.base import Check, Finding, Material
 from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, is_centikelvin
 
 CLIPPED = 0.005  # share of pixels beyond the bounds
+MIDDLE = (0.001, 0.999)  # quantiles: what lies beyond may be a few faulty pixels
 NARROW = 0.15  # of the range that pixels use
 EARTHLY_C = (-60.0, 650.0)  # what cameras measure without a special range
 KELVIN_C = (200.0, 400.0)  # "°C" between which a whole scene is rather one of -73 .. 127 °C in kelvin
+MAX_VALUES = 1 << 23  # torch takes no quantiles of twice as many
 FULL_16_BIT = 65535
 PLATEAU = 0.004  # share of an image's pixels at exactly its largest value
 WIDER = "Give wider bounds (data.bounds_c, temperature_bounds.json), from the same export as the images."
@@ -69,17 +71,16 @@ def _cut_off(material: Material, values: torch.Tensor) -> list[Finding]:
 
 def _unused(material: Material, values: torch.Tensor) -> list[Finding]:
     """Bounds of which images use little."""
-    if material.bounds_c is None or len(values) >= 1 << 24:  # torch takes no quantiles of more
-        return []
-    ends = values.quantile(values.new_tensor([0.001, 0.999]))
-    used = float(ends.diff())
-    if used >= NARROW:
+    if material.bounds_c is None:
         return []
     low, high = material.bounds_c
+    least, most = _celsius(material, values)
+    used = (most - least) / (high - low)
+    if used >= NARROW:
+        return []
     what = f"The images use {100 * used:.0f} % of the bounds {low:g} .. {high:g} °C."
     remedy = "Narrow the bounds to what the scene shows: losses and 8-bit greys spend the rest on nothing."
     if material.bounds_chosen:
-        least, most = (low + float(end) * (high - low) for end in ends)
         what = (
             f"99.8 % of the pixels lie within {least:.4g} .. {most:.4g} °C, {100 * used:.0f} % of the bounds {low:g} .. "
             f"{high:g} °C, which heatsplat took from the training images."
@@ -92,21 +93,36 @@ def _unused(material: Material, values: torch.Tensor) -> list[Finding]:
 
 
 def _of_unit(material: Material, values: torch.Tensor) -> list[Finding]:
-    """Temperatures that are rather kelvin or counts, by the bounds of a scene, else by the pixels of a camera's files."""
+    """Temperatures that are rather kelvin or counts, by the bounds that were given to a scene, else by the pixels."""
     if material.unit_k is None:
         return []
-    low, high = material.bounds_c or (float(values.min()), float(values.max()))
+    given = material.bounds_c is not None and not material.bounds_chosen
+    low, high = material.bounds_c if given else _celsius(material, values)
     remedy = _unit_remedy(material)
     if KELVIN_C[0] <= low and high <= KELVIN_C[1]:
         kelvin = f"kelvin of {low - KELVIN_AT_0_C:.4g} .. {high - KELVIN_AT_0_C:.4g} °C"
         what = f"All pixels lie within {low:.4g} .. {high:.4g} °C, which may be {kelvin}."
         return [Finding("bounds", 0.9, what, remedy)]
-    if material.bounds_c is None:  # a cold sky or a flame may be in view, but no scene consists of them
-        low, high = float(values.median()), float(values.median())
+    if not given:  # a cold sky or a flame may be in view, but no scene consists of them
+        low = high = _celsius(material, values.median()[None])[0]
     if low < EARTHLY_C[0] or high > EARTHLY_C[1]:
         shown = f"{low:g} .. {high:g} °C" if low < high else f"{low:.4g} °C (median)"
         return [Finding("bounds", 0.9, f"The images are said to show {shown}.", remedy)]
     return []
+
+
+def _celsius(material: Material, values: torch.Tensor) -> tuple[float, float]:
+    """Least and largest temperature of values; where they have bounds, of the 99.8 % in the middle."""
+    if material.bounds_c is None:
+        return float(values.min()), float(values.max())
+    low, high = material.bounds_c
+    middle = _few(values).quantile(values.new_tensor(MIDDLE))
+    return tuple(low + float(end) * (high - low) for end in middle)
+
+
+def _few(values: torch.Tensor) -> torch.Tensor:
+    """Evenly spread values, few enough for quantiles."""
+    return values[:: 1 + len(values) // MAX_VALUES]
 
 
 def _unit_remedy(material: Material) -> str:
@@ -129,10 +145,10 @@ def _unit_remedy(material: Material) -> str:
 
 def _counts_as_greys(material: Material, values: torch.Tensor) -> list[Finding]:
     """Greys of 16 bits, no temperatures so far, that are rather kelvin x 100."""
-    if material.unit_k is not None or material.stored != "grey16" or len(values) >= 1 << 24:
+    if material.unit_k is not None or material.stored != "grey16":
         return []
-    ends = values.double().quantile(torch.tensor([0.001, 0.01, 0.5, 0.99, 0.999], dtype=torch.float64)) * FULL_16_BIT
-    least, low, median, high, most = ends.tolist()
+    ends = values.double().new_tensor([MIDDLE[0], 0.01, 0.5, 0.99, MIDDLE[1]])
+    least, low, median, high, most = (FULL_16_BIT * _few(values).double().quantile(ends)).tolist()
     if most - least >= NARROW * FULL_16_BIT or not is_centikelvin(low, median, high):
         return []
     low_c, high_c = (CENTIKELVIN * end - KELVIN_AT_0_C for end in (least, most))
