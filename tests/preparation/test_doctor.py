@@ -17,6 +17,7 @@ from heatsplat.datamodules.synthetic_scene.film import SIZES, Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.writers import write_colmap
+from heatsplat.doctor.base import material_of
 from heatsplat.preparation.doctor import _photo_times, check, section
 from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.frames import Reading
@@ -85,6 +86,7 @@ def test_kelvin_in_a_scene_is_told_and_what_is_said_of_it_helps(tmp_path):
     low, high = float(recording.celsius.min()), float(recording.celsius.max())
     scene = Colmap(root=str(tmp_path / "counts"), raw="images", raw_scale=0.01).scene
     assert low - 1 < scene.thermal_range.min_c < scene.thermal_range.max_c < high + 1
+    assert material_of(scene).bounds_chosen and material_of(scene).stored == "counts"
     prepare(
         source=str(tmp_path / "floats" / "images"),
         target=tmp_path / "prepared",
@@ -93,7 +95,9 @@ def test_kelvin_in_a_scene_is_told_and_what_is_said_of_it_helps(tmp_path):
         counts={"offset_c": -273.15},
         poses=GivenPoses(str(tmp_path / "floats")),
     )
-    bounds = Colmap(root=str(tmp_path / "prepared")).scene.thermal_range
+    scene = Colmap(root=str(tmp_path / "prepared")).scene
+    assert not material_of(scene).bounds_chosen and material_of(scene).stored == "celsius"
+    bounds = scene.thermal_range
     assert (bounds.min_c, bounds.max_c) == pytest.approx((low, high), abs=0.5)
 
 
