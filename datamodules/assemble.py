@@ -28,7 +28,7 @@ from heatsplat.contracts import (
     ViewSet,
     evenly_spread,
 )
-from heatsplat.datamodules.bounds import celsius
+from heatsplat.datamodules.bounds import BOUNDS_FILE, MIN_CELSIUS, celsius
 from heatsplat.datamodules.formats.images import PSEUDO_COLOUR_LEVELS
 from heatsplat.datamodules.poses import MAX_COORDINATE
 from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, image_notes, prepare
@@ -37,12 +37,17 @@ from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.splits import SplitRule
 from heatsplat.datamodules.weather import weather_at_frame
 from heatsplat.datamodules.weather_table import FIRST_EPOCH_S
+from heatsplat.physics.defects import dead_pixels
 
 log = logging.getLogger(__name__)
 
 MAX_VAL_VIEWS = 8
 # Seconds: three hundred centuries, more than any clock of a recording counts.
 MAX_TIME_S = 1e12
+# Share of the range of the training images that bounds taken from them leave at both ends, for the noise of held-out ones.
+RANGE_MARGIN = 0.01
+DEAD_PIXEL_FRAMES = 8  # images that dead pixels are told from
+MAX_OUTSIDE = 0.95  # share of the training pixels beyond given bounds, above which nothing is left to learn
 
 
 @dataclass(frozen=True)
@@ -116,9 +121,12 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
     for i in used:
         time_s = None if times is None else times[i] - first_s
         stored[i] = _store(i, frames[i], prepared.pop(i), time_s, origin, raw, options)
-    if raw.counts:
-        notes["clipped_fraction"] = _clipped_fraction(list(stored.values()))
     bounds = raw.thermal_range
+    if raw.counts and bounds:
+        _check_bounds(raw.name, [stored[i] for i in train], raw.counts, bounds)
+        notes["clipped_fraction"] = _clipped_fraction(list(stored.values()))
+        if "training_images_c" in notes:
+            _warn_of_cut_off(list(stored.values()), raw.counts, bounds)
     unknown = "none: image values are no temperatures, and errors in °C are undefined"
     notes["thermal_range_c"] = unknown if bounds is None else [bounds.min_c, bounds.max_c]
 
@@ -238,8 +246,8 @@ def _with_temperatures(raw: RawScene, train: Sequence[PreparedImage], notes: dic
         counts = CELSIUS
         notes["encoding"] = "float pixels are temperatures in °C"
     if counts and bounds is None:
-        bounds = _range_of(train, counts)
-        notes["bounds_source"] = "0.1 and 99.9 percentile of the training images: none were given"
+        bounds, notes["training_images_c"] = _range_of(train, counts)
+        notes["bounds_source"] = "minimum and maximum of the training images without dead pixels: none were given"
     return replace(raw, counts=counts, thermal_range=bounds)
 
 
@@ -338,15 +346,47 @@ def _origin_of(frames: Sequence[RawFrame], points: np.ndarray) -> np.ndarray:
     return np.round(centroid)
 
 
-def _range_of(prepared: Sequence[PreparedImage], counts: Counts) -> ThermalRange:
-    """Bounds that hold 99.8 % of the unmasked pixels; the rest clips, so that a hot pixel does not flatten a scene."""
-    # A percentile needs no more than a few million pixels.
-    stride = 1 + sum(p.thermal.size for p in prepared) // 4_000_000
-    values = np.concatenate([(p.thermal if p.mask is None else p.thermal[p.mask]).ravel()[::stride] for p in prepared])
-    low, high = map(float, np.percentile(values, [0.1, 99.9])) if values.size else (0.0, 0.0)
+def _range_of(prepared: Sequence[PreparedImage], counts: Counts) -> tuple[ThermalRange, list[float]]:
+    """Bounds that hold all unmasked pixels, and the minimum and maximum of those with dead ones, in °C.
+
+    Not percentiles: a defect of a few hot pixels is what an inspection looks for. Dead pixels and counts at absolute zero are
+    no temperatures of the scene and clip, so that they do not flatten it.
+    """
+    dead = _dead_pixels(prepared)
+    lows, highs, all_lows, all_highs = [], [], [], []
+    for p in prepared:
+        known = np.ones(p.thermal.shape, dtype=bool) if p.mask is None else p.mask
+        least = (MIN_CELSIUS - counts.offset_c) / counts.scale
+        for keep, low, high in (
+            (known, all_lows, all_highs),
+            (known & ~dead[p.thermal.shape] & (p.thermal > least), lows, highs),
+        ):
+            if keep.any():
+                low.append(float(p.thermal[keep].min()))
+                high.append(float(p.thermal[keep].max()))
+    low, high = (min(lows), max(highs)) if lows else (0.0, 0.0)
     if not low < high:
         raise SceneError(f"the training images are constant ({low}), so no temperature range can be taken from them")
-    return ThermalRange(counts.scale * low + counts.offset_c, counts.scale * high + counts.offset_c)
+    margin = RANGE_MARGIN * (high - low)
+    ends = (low - margin, high + margin, min(all_lows), max(all_highs))
+    low_c, high_c, *seen_c = (counts.scale * end + counts.offset_c for end in ends)
+    return ThermalRange(max(low_c, MIN_CELSIUS), high_c), seen_c
+
+
+def _dead_pixels(prepared: Sequence[PreparedImage]) -> dict[tuple[int, ...], np.ndarray]:
+    """Dead pixels [H, W] bool by the size of images, told from a few of the images of that size."""
+    sizes: dict[tuple[int, ...], list[PreparedImage]] = {}
+    for p in prepared:
+        sizes.setdefault(p.thermal.shape, []).append(p)
+    found = {}
+    for size, alike in sizes.items():
+        few = [alike[i] for i in evenly_spread(len(alike), DEAD_PIXEL_FRAMES)]
+        images = np.stack([p.thermal.astype(np.float32) for p in few])
+        for image, p in zip(images, few, strict=True):
+            if p.mask is not None:
+                image[~p.mask] = np.nan
+        found[size] = dead_pixels(torch.from_numpy(images)).numpy()
+    return found
 
 
 def _scaling(dtype: np.dtype, counts: Counts | None, bounds: ThermalRange | None) -> tuple[float, float]:
@@ -356,7 +396,43 @@ def _scaling(dtype: np.dtype, counts: Counts | None, bounds: ThermalRange | None
     return (bounds.min_c - counts.offset_c) / counts.scale, bounds.span_k / counts.scale
 
 
+def _outside(stored: _Stored) -> np.ndarray:
+    """Which pixels [H, W] lie outside the bounds and are clipped to them."""
+    return (stored.thermal < stored.zero) | (stored.thermal > stored.zero + stored.full)
+
+
 def _clipped_fraction(stored: Sequence[_Stored]) -> float:
     """Share of all pixels that lie outside the bounds and are clipped to them."""
-    outside = sum(int(((s.thermal < s.zero) | (s.thermal > s.zero + s.full)).sum()) for s in stored)
-    return outside / sum(s.thermal.size for s in stored)
+    return sum(int(_outside(s).sum()) for s in stored) / sum(s.thermal.size for s in stored)
+
+
+def _check_bounds(name: str, train: Sequence[_Stored], counts: Counts, bounds: ThermalRange) -> None:
+    """Raises SceneError where bounds leave next to nothing of the training images."""
+    outside = total = 0
+    lows, highs = [], []
+    for s in train:
+        known = np.ones(s.thermal.shape, dtype=bool) if s.mask is None else s.mask
+        if known.any():
+            outside, total = outside + int(_outside(s)[known].sum()), total + int(known.sum())
+            lows.append(float(s.thermal[known].min()))
+            highs.append(float(s.thermal[known].max()))
+    if total and outside > MAX_OUTSIDE * total:
+        low, high = (counts.scale * end + counts.offset_c for end in (min(lows), max(highs)))
+        raise SceneError(
+            f"scene {name}: {100 * outside / total:.4g} % of the pixels of the training images lie beyond the bounds "
+            f"{bounds.min_c:g} .. {bounds.max_c:g} °C; the images show {low:.4g} .. {high:.4g} °C. Give bounds in °C that hold "
+            f"them: data.bounds_c=[min,max] with data=colmap, else {BOUNDS_FILE}. If the bounds are right, the unit of the "
+            "images is not (kelvin?)"
+        )
+
+
+def _warn_of_cut_off(stored: Sequence[_Stored], counts: Counts, bounds: ThermalRange) -> None:
+    """Warns of pixels that count and lie beyond bounds that nobody gave: dead ones, or those of held-out images."""
+    cut = np.concatenate([s.thermal[_outside(s) if s.mask is None else _outside(s) & s.mask] for s in stored])
+    if cut.size:
+        low, high = (counts.scale * float(end) + counts.offset_c for end in (cut.min(), cut.max()))
+        log.warning(
+            "%d pixels of %.4g .. %.4g °C are cut off: the bounds %.4g .. %.4g °C hold the training images without dead "
+            "pixels. Leave dead pixels out with masks/, or give data.bounds_c=[min,max] (data=colmap) or %s",
+            *(cut.size, low, high, bounds.min_c, bounds.max_c, BOUNDS_FILE),
+        )

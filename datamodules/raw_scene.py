@@ -75,7 +75,8 @@ class RawScene:
         frames: at least one training and one test frame under the split.
         points: [P, 3] in the world of the frames' ``viewmat``, at least 4 finite ones.
         point_colors: [P, 3] in [0, 1], or None.
-        thermal_range: bounds in °C; with ``counts`` and without bounds they are taken from the training images.
+        thermal_range: bounds in °C; with ``counts`` (or float pixels) and without bounds they are taken from the training
+            images.
         counts: map from stored numbers to °C, for raw sensor data; None when integers span their type.
         ambient_c: temperature of the surroundings, or None.
         metres_per_unit: scale of the world, or None.

@@ -144,8 +144,16 @@ def _recorded(device: Device, zone: str | None) -> Material:
         images=images,
         unit_k=bounds[1] - bounds[0] if bounds is not None else 1.0 if known else None,
         bounds_c=bounds,
+        stored=_stored(frames[chosen[0]]),
         rgb_times_s=_photo_times(frames, zone),
     )
+
+
+def _stored(frame: ThermalFrame) -> str:
+    """What the files of a camera hold, as ``Material.stored`` has it."""
+    if frame.calibration is not None and frame.calibration.scale is None:
+        return "radiometric"
+    return {"u1": "grey8", "u2": "counts", "f4": "celsius"}.get(frame.load().dtype.str[1:], "")
 
 
 def _bounds_of_greys(frame: ThermalFrame) -> tuple[float, float] | None:

@@ -14,11 +14,8 @@ from heatsplat.datamodules.formats.dji import PER_KELVIN
 from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.physics.planck import Band
 from heatsplat.physics.radiometry import BandResponse, PlanckResponse
-from heatsplat.physics.units import KELVIN_AT_0_C
+from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, MEDIAN_C, is_centikelvin
 
-CENTIKELVIN = 0.01
-# 16-bit frames whose median and whose bulk lie so are taken for kelvin x 100 (Lepton's TLinear, Boson's radiometric video).
-MEDIAN_C, BULK_K = (-40.0, 100.0), 200.0
 # °C per count of other cameras that store kelvin; nothing in a file tells them apart, so they are named and asked for.
 OTHERS = {
     "DJI's 1/64 K": 1.0 / PER_KELVIN,
@@ -108,8 +105,9 @@ class Meaning:
                 self.of_temperatures(self.scale, offset),
                 f"counts: °C = {self.scale:g} * count {offset:+g}, for {path.name} {low:.1f} .. {high:.1f} °C",
             )
-        low, median, high = np.percentile(sample, (1, 50, 99)) * CENTIKELVIN - KELVIN_AT_0_C
-        if MEDIAN_C[0] < median < MEDIAN_C[1] and high - low < BULK_K:
+        percentiles = np.percentile(sample, (1, 50, 99))
+        if is_centikelvin(*percentiles):
+            low, _, high = CENTIKELVIN * percentiles - KELVIN_AT_0_C
             return (
                 self.of_temperatures(CENTIKELVIN, -KELVIN_AT_0_C),
                 f"counts taken for kelvin x 100, for {path.name} then has {low:.1f} .. {high:.1f} °C; "

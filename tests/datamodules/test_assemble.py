@@ -106,11 +106,45 @@ def test_counts_without_bounds_take_those_of_the_training_images():
     counts = [np.linspace(1000, 2000, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH).astype(np.uint16) for _ in range(9)]
     counts[0][:] = 60000  # a test frame, which must not set the range
     scene = scene_of(counts, counts=Counts(0.1, -50.0))
-    assert scene.thermal_range.min_c == pytest.approx(50.1, abs=0.2)
-    assert scene.thermal_range.max_c == pytest.approx(149.9, abs=0.2)
-    assert scene.notes["bounds_source"].startswith("0.1 and 99.9 percentile")
-    assert scene.notes["clipped_fraction"] == pytest.approx((1 + 8 * 0.002) / 9, abs=2e-3)
+    assert scene.thermal_range.min_c == pytest.approx(49.0) and scene.thermal_range.max_c == pytest.approx(151.0)
+    assert scene.notes["bounds_source"].startswith("minimum and maximum of the training images")
+    assert scene.notes["training_images_c"] == pytest.approx([50.0, 150.0])
+    assert scene.notes["clipped_fraction"] == pytest.approx(1 / 9)
     assert scene.test[0].thermal.max() == 1
+
+
+def test_a_few_hot_pixels_are_within_the_bounds_of_training_images(caplog):
+    rng = np.random.default_rng(0)
+    images = [rng.uniform(12.0, 30.0, (HEIGHT, WIDTH)).astype(np.float32) for _ in range(9)]
+    images[3][10, 12] = 90.0  # one pixel of one image
+    with caplog.at_level(logging.WARNING):
+        scene = scene_of(images)
+    shown = scene.thermal_range.to_celsius(scene.train[2].thermal[..., 0])
+    np.testing.assert_allclose(shown, images[3], atol=1e-4)
+    assert 90.0 < scene.thermal_range.max_c < 91.0 and scene.notes["clipped_fraction"] == 0
+    assert "cut off" not in caplog.text
+
+
+def test_dead_pixels_and_counts_of_absolute_zero_set_no_bounds_and_are_warned_of(caplog):
+    rng = np.random.default_rng(0)
+    images = [(rng.uniform(19000, 19500, (HEIGHT, WIDTH))).astype(np.uint16) for _ in range(9)]
+    for image in images:
+        image[10, 12] = 40000
+    images[4][3, 4] = 0
+    with caplog.at_level(logging.WARNING):
+        scene = scene_of(images, counts=Counts(1 / 64, -273.15))
+    low, high = 19000 / 64 - 273.15, 19500 / 64 - 273.15
+    assert low - 0.2 < scene.thermal_range.min_c < low + 0.2 and high - 0.2 < scene.thermal_range.max_c < high + 0.2
+    assert scene.notes["training_images_c"] == pytest.approx([-273.15, 40000 / 64 - 273.15])
+    assert "10 pixels of -273.1 .. 351.9 °C are cut off" in caplog.text and "data.bounds_c" in caplog.text
+
+
+def test_bounds_that_leave_next_to_nothing_of_the_images_are_refused():
+    images = [12 + grey(i).astype(np.float32) / 10 for i in range(9)]
+    said = r"100 % of the pixels .* beyond the bounds 293 .. 323 °C; the images show 12\b.* °C.*data.bounds_c"
+    with pytest.raises(SceneError, match=said):
+        scene_of(images, thermal_range=ThermalRange(293, 323))
+    assert scene_of(images, thermal_range=ThermalRange(20, 22)).notes["clipped_fraction"] > 0.8
 
 
 def test_constant_images_have_no_range_of_their_own():

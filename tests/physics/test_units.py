@@ -26,3 +26,9 @@ def test_constants_are_defined_once():
     found = sorted(path.name for path in sources for _ in names.findall(path.read_text()))
     assert found == ["spherical_harmonics.py", "units.py", "units.py", "units.py"]
     assert np.float32(C0) == kernel._A0
+
+
+def test_counts_that_are_plausible_as_kelvin_x_100():
+    assert units.is_centikelvin(28500.0, 29500.0, 31500.0)
+    assert not units.is_centikelvin(12000.0, 13000.0, 14000.0)  # -143 °C
+    assert not units.is_centikelvin(5000.0, 29500.0, 60000.0)  # 550 K between the coldest and the hottest

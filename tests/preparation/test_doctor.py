@@ -1,6 +1,7 @@
 """The doctor on folders: a scene that trains, and a camera's files."""
 
 import json
+import shutil
 from dataclasses import replace
 from datetime import timedelta
 
@@ -10,15 +11,19 @@ from PIL import Image
 from recordings import read_frames
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, write_camera
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.writers import write_colmap
+from heatsplat.doctor.base import material_of
 from heatsplat.preparation.doctor import _photo_times, check, section
 from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.frames import Reading
+from heatsplat.preparation.given_poses import GivenPoses
 from heatsplat.preparation.meaning import Meaning
+from heatsplat.preparation.prepare import prepare
 
 
 def test_a_clean_scene_has_no_findings_and_the_file_says_so(tmp_path):
@@ -59,6 +64,41 @@ def test_greys_that_the_camera_stretched_are_found_in_its_files_before_they_are_
     reading = Reading(Meaning(bounds_c=(low - 1.0, high + 1.0)))
     said = {name: section(tmp_path / name, reading).values["findings"] for name in ("stretched", "linear")}
     assert said["stretched"][0]["check"] == "agc" and said["linear"] == []
+
+
+def test_kelvin_in_a_scene_is_told_and_what_is_said_of_it_helps(tmp_path):
+    recording = film(Scene(PRESETS["static"]), Size(64, 52, 8, 60))
+    for name, kelvin in (("floats", 1.0), ("counts", 100.0)):
+        write_colmap(recording, tmp_path / name)
+        (tmp_path / name / "temperature_bounds.json").unlink()
+        shutil.rmtree(tmp_path / name / "raw16")
+        for path, celsius in zip(sorted((tmp_path / name / "images").iterdir()), recording.celsius, strict=True):
+            path.unlink()
+            values = kelvin * (celsius.astype(np.float64) + 273.15)
+            file = path if name == "counts" else path.with_suffix(".tiff")
+            Image.fromarray(values.astype(np.uint16 if name == "counts" else np.float32)).save(file)
+    model = tmp_path / "floats" / "sparse" / "0" / "images.bin"
+    model.write_bytes(model.read_bytes().replace(b".png", b".tiff"))
+    said = check(str(tmp_path / "floats"), tmp_path)
+    assert any("may be kelvin" in one.what and "counts.offset_c=-273.15" in one.remedy for one in said)
+    said = check(str(tmp_path / "counts"), tmp_path)
+    assert any("kelvin x 100" in one.what and "data.raw=images data.raw_scale=0.01" in one.remedy for one in said)
+    low, high = float(recording.celsius.min()), float(recording.celsius.max())
+    scene = Colmap(root=str(tmp_path / "counts"), raw="images", raw_scale=0.01).scene
+    assert low - 1 < scene.thermal_range.min_c < scene.thermal_range.max_c < high + 1
+    assert material_of(scene).bounds_chosen and material_of(scene).stored == "counts"
+    prepare(
+        source=str(tmp_path / "floats" / "images"),
+        target=tmp_path / "prepared",
+        conditions={},
+        uncertainty={},
+        counts={"offset_c": -273.15},
+        poses=GivenPoses(str(tmp_path / "floats")),
+    )
+    scene = Colmap(root=str(tmp_path / "prepared")).scene
+    assert not material_of(scene).bounds_chosen and material_of(scene).stored == "celsius"
+    bounds = scene.thermal_range
+    assert (bounds.min_c, bounds.max_c) == pytest.approx((low, high), abs=0.5)
 
 
 def test_clocks_of_which_one_says_no_zone_may_be_hours_apart(tmp_path):

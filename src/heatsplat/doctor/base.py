@@ -65,6 +65,9 @@ class Material:
         all_cameras: of all training frames, or None.
         points: [P, 3] of the scene, or None where there are none but random ones.
         bounds_c: temperatures of image values 0 and 1, or None.
+        bounds_chosen: whether heatsplat took these bounds from the training images, as nobody gave any.
+        stored: what the image files hold: "celsius" (floating point), "radiometric", "counts", "grey8" or "grey16"; "" where
+            unknown.
         clipped: share of pixels that lay outside the bounds, or None where unknown.
         answers: [F, k] how surfaces answer recorded weather in the frames of ``images``; None without a record.
         lenses: for every frame, the number of the camera that took it; empty where one took all.
@@ -83,6 +86,8 @@ class Material:
     all_cameras: Sequence[Camera] | None = None
     points: Tensor | None = None
     bounds_c: tuple[float, float] | None = None
+    bounds_chosen: bool = False
+    stored: str = ""
     clipped: float | None = None
     answers: Tensor | None = None
     lenses: Sequence[int] = ()
@@ -206,6 +211,8 @@ def material_of(scene: SceneData) -> Material:
         all_cameras=[frame.camera for frame in frames],
         points=points,
         bounds_c=None if bounds is None else (bounds.min_c, bounds.max_c),
+        bounds_chosen="training_images_c" in scene.notes,
+        stored=_stored(scene),
         clipped=scene.notes.get("clipped_fraction"),
         answers=drivers(scene.weather, seen_s, air=(QUICK_PER_S, SLOW_PER_S)),
         lenses=_lenses(frames),
@@ -216,6 +223,18 @@ def material_of(scene: SceneData) -> Material:
 def _looked(position: int, view: View) -> tuple[int, Camera, Tensor | None]:
     """What is kept of a view beside its thermal image: its position, its camera and its photo."""
     return position, view.camera, None if view.rgb is None else coarse(view.rgb.mean(2))
+
+
+def _stored(scene: SceneData) -> str:
+    """What the image files of a scene hold, as its loader noted it."""
+    if "radiometric" in scene.notes.get("encoding", ""):
+        return "radiometric"
+    kinds = {
+        "float32": "celsius",
+        "uint8": "grey8",
+        "uint16": "counts" if "clipped_fraction" in scene.notes else "grey16",
+    }
+    return kinds.get(scene.notes.get("pixel_type", ""), "")
 
 
 def _without_camera(scene: SceneData) -> tuple[int, int]:
