@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from heatsplat.composition import compose, followed, overlap
+from heatsplat.composition import compose, followed, overlap, run_of
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
 from heatsplat.io.command_lines import keys_of
 from heatsplat.io.settings import at
+from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.trust import trusted
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.module import CHECKPOINT_KEY
@@ -27,6 +29,7 @@ LEARNED = {  # and what in these says how it learns, or how long
 # What may differ beside the length from the run whose checkpoint is given: where it is, when it ends, what is decided already.
 OPEN = ("data.root.", "renderer.backend.", "callbacks.plateau.", "effects.price.", "effects.least_db_per_ms.")
 ABSENT = object()  # of what an older heatsplat did not have
+SHOWN = 5  # names of settings in a message
 
 
 def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
@@ -41,20 +44,35 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
 
     Raises:
         SceneError: the checkpoint that was given is none, or of a run with another budget or other settings than its length.
+        OccupiedError: as ``check_own``.
     """
     if config["ckpt"] is not None:
+        check_own(config, output_dir)
         return _continued(config, stored_config(load_checkpoint(config["ckpt"])))
     for path, checkpoint in checkpoints_in(output_dir):
         stored = stored_config(checkpoint)
-        changed = differences(config, stored)
-        if changed:
-            log.warning("%s has other settings (%s); starting from the beginning", path, ", ".join(changed))
-            break
+        _check_own(config, output_dir, path, checkpoint)
         config = config | _measured(stored, path, "verdicts", "choosing_seconds", "budget")
         if checkpoint["global_step"] < planned_end(checkpoint):
             log.info("going on from step %d of %s", checkpoint["global_step"], path)
             return config | {"ckpt": str(path)}
     return config
+
+
+def check_own(config: dict[str, Any], output_dir: Path) -> None:
+    """Nothing where a run's folder has no checkpoints, or its newest has the same settings, or the run goes on from one of them.
+
+    Args:
+        config: as composed and checked.
+        output_dir: folder of the run.
+
+    Raises:
+        OccupiedError: its checkpoints are of a run with other settings and would be overwritten.
+    """
+    if config["ckpt"] is not None and Path(run_of(config["ckpt"])) == output_dir.resolve():
+        return  # ``_continued`` compares the settings, and allows more steps
+    for path, checkpoint in islice(checkpoints_in(output_dir), 1):
+        _check_own(config, output_dir, path, checkpoint)
 
 
 def on_scene(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
@@ -115,6 +133,17 @@ def stored_config(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     own = checkpoint.get(CHECKPOINT_KEY)
     config = own.get("config") if isinstance(own, dict) else None
     return config if isinstance(config, dict) else {}
+
+
+def _check_own(config: dict[str, Any], output_dir: Path, path: Path, checkpoint: Mapping[str, Any]) -> None:
+    """Raises OccupiedError where a checkpoint in a run's folder is of other settings."""
+    if changed := differences(config, stored_config(checkpoint)):
+        more = f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else ""
+        raise OccupiedError(
+            f"{output_dir} holds an unfinished run with other settings ({', '.join(changed[:SHOWN])}{more}), of which "
+            f"{path.name} is of step {checkpoint['global_step']}: give another folder with hydra.run.dir; or go on with that "
+            f"run, with its settings and ckpt={path}; or delete that folder"
+        )
 
 
 def _measured(stored: Mapping[str, Any], path: Path | str, *keys: str) -> dict[str, Any]:
