@@ -204,7 +204,7 @@ def test_clipping_and_a_plateau_are_settings_that_are_learned_by(trained):
 def test_a_checkpoint_of_another_scene_or_image_size_is_refused_with_both(trained, changed):
     """Of a folder elsewhere (data.root) only its scene tells."""
     folder, _, _ = trained
-    config = went_on(folder)
+    config = went_on(folder, "max_steps=9")
     there = build(heatsplat.compose([*QUICK, changed])["data"]).scene
     with pytest.raises(SceneError, match=r"was trained on static in \d+ x \d+ pixels, and this is (static|cooling) in"):
         on_scene(config, there)
@@ -241,6 +241,16 @@ def test_a_checkpoint_goes_on_for_longer_with_all_that_follows_from_the_length(t
     assert longer["ckpt"] and longer["optim"]["accumulate"] == 5 * config["optim"]["accumulate"]
 
 
+def test_a_checkpoint_of_the_last_step_or_a_later_one_is_refused_before_a_run_that_trains_nothing(trained):
+    for steps in (8, 5):
+        with pytest.raises(
+            SceneError,
+            match=rf"last.ckpt is of step 8 already, and max_steps={steps}: .*more max_steps, or evaluate it",
+        ):
+            went_on(trained[0], f"max_steps={steps}")
+    assert went_on(trained[0], "max_steps=9")["ckpt"]
+
+
 def test_settings_that_an_older_heatsplat_did_not_have_are_warned_of_unless_they_are_asked_for(
     trained, tmp_path, caplog
 ):
@@ -249,7 +259,7 @@ def test_settings_that_an_older_heatsplat_did_not_have_are_warned_of_unless_they
     for settings in (stored["heatsplat"]["config"], stored["heatsplat"]["config"]["module"]):
         settings["optim"] = {key: value for key, value in settings["optim"].items() if key != "averaged"}
     torch.save(stored, tmp_path / "old.ckpt")
-    assert resumed(heatsplat.compose([*QUICK, f"ckpt={tmp_path}/old.ckpt"]), tmp_path)["ckpt"]
+    assert resumed(heatsplat.compose([*QUICK, f"ckpt={tmp_path}/old.ckpt", "max_steps=9"]), tmp_path)["ckpt"]
     assert "old.ckpt is of an older heatsplat without optim.averaged: they count from here on" in caplog.text
     with pytest.raises(SceneError, match="was trained with another optim.averaged"):
         resumed(heatsplat.compose([*QUICK, f"ckpt={tmp_path}/old.ckpt", "optim.averaged=0.2"]), tmp_path)

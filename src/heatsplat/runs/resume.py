@@ -43,12 +43,13 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
         output_dir: folder of the run.
 
     Raises:
-        SceneError: the checkpoint that was given is none, or of a run with another budget or other settings than its length.
+        SceneError: the checkpoint that was given is none, of a run with another budget or other settings than its length, or of
+            the last step of this run or a later one.
         OccupiedError: as ``check_own``.
     """
     if config["ckpt"] is not None:
         check_own(config, output_dir)
-        return _continued(config, stored_config(load_checkpoint(config["ckpt"])))
+        return _continued(config, load_checkpoint(config["ckpt"]))
     for path, checkpoint in checkpoints_in(output_dir):
         stored = stored_config(checkpoint)
         _check_own(config, output_dir, path, checkpoint)
@@ -159,8 +160,9 @@ def _differing(key: str, one: Any, other: Any) -> Iterator[str]:
         yield key
 
 
-def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
+def _continued(config: dict[str, Any], checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration with what was measured for the run of the checkpoint that it was given."""
+    stored = stored_config(checkpoint)
     ckpt, asked, plan = config["ckpt"], config["budget"], stored.get("budget")
     if asked is not None and plan is None:
         raise SceneError(f"{ckpt} was trained without a budget and keeps its schedule: leave budget out")
@@ -168,6 +170,7 @@ def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, A
         raise SceneError(f"{ckpt} was planned for budget={plan['asked_s']:g}s and keeps its plan: give that")
     if stored.get("name") == config["name"]:  # another method is refused with the tensors in which it differs
         _check_same_settings(config, stored)
+        _check_steps_left(config, checkpoint)
     config = config | _measured(stored, ckpt, "budget", "scene")
     if assembly.chooses_effects(config):
         config = config | _measured(stored, ckpt, "verdicts", "choosing_seconds")
@@ -197,3 +200,16 @@ def _check_same_settings(config: dict[str, Any], stored: Mapping[str, Any]) -> N
         )
     if new:
         log.warning("%s is of an older heatsplat without %s: they count from here on", config["ckpt"], ", ".join(new))
+
+
+def _check_steps_left(config: Mapping[str, Any], checkpoint: Mapping[str, Any]) -> None:
+    """Raises SceneError where a run would end at the step of its checkpoint or before, and would train nothing."""
+    planned = config["budget"] is not None
+    step, end = checkpoint["global_step"], planned_end(checkpoint) if planned else config["max_steps"]
+    if step >= end:
+        ends = f"the plan of its budget ends at step {end}" if planned else f"max_steps={end}"
+        more = "" if planned else "give more max_steps, or "
+        raise SceneError(
+            f"{config['ckpt']} is of step {step} already, and {ends}: nothing is left to train; {more}evaluate it "
+            f"(src/evaluate.py ckpt={config['ckpt']})"
+        )
