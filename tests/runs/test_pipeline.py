@@ -1,6 +1,7 @@
 """The steps that make a run's configuration ready, and the Python interface around them."""
 
 import math
+import shutil
 from dataclasses import replace
 
 import hydra
@@ -10,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from running import TINY
 
 import heatsplat
-from heatsplat.composition import build
+from heatsplat.composition import build, run_of
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.runs.checks import checked
@@ -249,6 +250,19 @@ def test_a_checkpoint_of_the_last_step_or_a_later_one_is_refused_before_a_run_th
         ):
             went_on(trained[0], f"max_steps={steps}")
     assert went_on(trained[0], "max_steps=9")["ckpt"]
+
+
+def test_the_folder_of_a_run_means_its_last_checkpoint(trained, tmp_path):
+    folder, _, _ = trained
+    last = folder / "checkpoints" / "last.ckpt"
+    for place in (folder, folder / "checkpoints", last):
+        assert run_of(str(place)) == str(folder.resolve())
+        assert heatsplat.load(place).checkpoint["global_step"] == 8
+        config = heatsplat.compose([*QUICK, f"ckpt={place}", "max_steps=9"])
+        assert resumed(checked(config), tmp_path)["ckpt"] == str(last)
+    shutil.copytree(folder, tmp_path / "run", ignore=shutil.ignore_patterns("last.ckpt"))
+    with pytest.raises(SceneError, match=rf"no checkpoint at {tmp_path}/run; there are: .*/step_000008.ckpt"):
+        heatsplat.load(tmp_path / "run")
 
 
 def test_settings_that_an_older_heatsplat_did_not_have_are_warned_of_unless_they_are_asked_for(

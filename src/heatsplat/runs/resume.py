@@ -12,6 +12,7 @@ from heatsplat.composition import compose, followed, overlap, run_of
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
 from heatsplat.io.command_lines import keys_of
+from heatsplat.io.results import checkpoint_of
 from heatsplat.io.settings import at
 from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.trust import trusted
@@ -48,6 +49,7 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
         OccupiedError: as ``check_own``.
     """
     if config["ckpt"] is not None:
+        config = config | {"ckpt": str(checkpoint_of(config["ckpt"]))}
         check_own(config, output_dir)
         return _continued(config, load_checkpoint(config["ckpt"]))
     for path, checkpoint in checkpoints_in(output_dir):
