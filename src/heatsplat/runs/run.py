@@ -264,6 +264,8 @@ def load(
     changed = {key: None if value == "null" else value for key, value in (data or {}).items() if value is not None}
     if "root" in changed:
         changed["root"] = str(Path(changed["root"]).expanduser().resolve())
+    if changed.get("split", "list") != "list" and config["data"].get("split_file"):
+        changed = {"split_file": None} | changed  # which belongs to the rule of training
     if "weather" in changed and "weather" not in config["data"]:
         raise SceneError(f"data.weather={changed['weather']}: the data set of this checkpoint has no weather to choose")
     with _naming(checkpoint):
