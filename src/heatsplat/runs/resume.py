@@ -52,9 +52,10 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
         config = config | {"ckpt": str(checkpoint_of(config["ckpt"]))}
         check_own(config, output_dir)
         return _continued(config, load_checkpoint(config["ckpt"]))
+    composed = config  # of which the plan of an earlier budget is no part
     for path, checkpoint in checkpoints_in(output_dir):
         stored = stored_config(checkpoint)
-        _check_own(config, output_dir, path, checkpoint)
+        _check_own(composed, output_dir, path, checkpoint)
         config = config | _measured(stored, path, "verdicts", "choosing_seconds", "budget")
         if checkpoint["global_step"] < planned_end(checkpoint):
             log.info("going on from step %d of %s", checkpoint["global_step"], path)
@@ -144,7 +145,7 @@ def _check_own(config: dict[str, Any], output_dir: Path, path: Path, checkpoint:
         more = f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else ""
         raise OccupiedError(
             f"{output_dir} holds an unfinished run with other settings ({', '.join(changed[:SHOWN])}{more}), of which "
-            f"{path.name} is of step {checkpoint['global_step']}: give another folder with hydra.run.dir; or go on with that "
+            f"{path.name} is of step {checkpoint.get('global_step')}: give another folder with hydra.run.dir; or go on with that "
             f"run, with its settings and ckpt={path}; or delete that folder"
         )
 
@@ -172,10 +173,11 @@ def _continued(config: dict[str, Any], checkpoint: Mapping[str, Any]) -> dict[st
         raise SceneError(f"{ckpt} was planned for budget={plan['asked_s']:g}s and keeps its plan: give that")
     if stored.get("name") == config["name"]:  # another method is refused with the tensors in which it differs
         _check_same_settings(config, stored)
-        _check_steps_left(config, checkpoint)
     config = config | _measured(stored, ckpt, "budget", "scene")
     if assembly.chooses_effects(config):
         config = config | _measured(stored, ckpt, "verdicts", "choosing_seconds")
+    if stored.get("name") == config["name"]:
+        _check_steps_left(config, checkpoint)
     return config
 
 
