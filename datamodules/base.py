@@ -43,7 +43,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         split: every_8th, quarter_centre, block, names, folders, json or list (``heatsplat.datamodules.splits``).
         split_fraction: share of the frames that ``block`` holds out.
         split_position: where its stretch lies in time, 0 (start) to 1 (end).
-        split_file: file of test names for ``list``.
+        split_file: file of test names for ``list``, relative to the scene or the working directory.
         seed: of the order of views, and of random points where a scene has none.
         thermal_channels: 1, or 3 for pseudo-colour without temperatures.
         masks: folder in the scene with a mask <image name>.png per image (COLMAP's rule); used where it exists.
@@ -81,9 +81,8 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         self.degrade, self.upsample = degrade, upsample
         self.scene_name = scene
         self.downscale = downscale
-        self.split = SplitRule(
-            split, split_fraction, split_position, Path(split_file).expanduser() if split_file else None
-        )
+        folder = Path(root).expanduser() / (scene or "") if root else None
+        self.split = SplitRule(split, split_fraction, split_position, split_file or None, folder)
         self.seed = seed
         self.thermal_channels = thermal_channels
         self.masks = masks

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.file_names import same_files
-from heatsplat.datamodules.side_files import read_table
+from heatsplat.datamodules.side_files import found_file, read_table
 from heatsplat.datamodules.timestamps import dji_time, time_by_pattern, times_from_csv
 
 FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
@@ -68,8 +68,7 @@ class FrameTimes:
         return None, "none (set data.time_regex or data.time_csv)"
 
     def _table(self, folder: Path, names: Sequence[str]) -> tuple[Mapping[str, float], str]:
-        path = folder / Path(self.time_csv).expanduser()
-        path = path if path.is_file() else Path(self.time_csv).expanduser().absolute()
+        path = found_file("data.time_csv", self.time_csv, folder)
         times = _looked_up(times_from_csv(path, self.time_csv_name, self.time_csv_time), names, path)
         if missing := [name for name in names if name not in times]:
             raise SceneError(

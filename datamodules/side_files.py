@@ -16,6 +16,26 @@ from typing import Any
 from heatsplat.contracts import SceneError
 
 
+def found_file(key: str, path: str | Path, folder: Path | None) -> Path:
+    """The file that a setting of the data names: in the folder of the scene, else in the working directory.
+
+    Args:
+        key: the setting, such as "data.time_csv", for the message.
+        path: its value.
+        folder: of the scene; None where it has none.
+
+    Raises:
+        SceneError: it is in neither, with both.
+    """
+    path = Path(path).expanduser()
+    places = [place.absolute() / path for place in (folder, Path()) if place is not None]
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        told = " and no ".join(dict.fromkeys(str(place) for place in places))
+        raise SceneError(f"{key}={path}: there is no file {told}")
+    return found
+
+
 def read_text(path: Path) -> str:
     """Content of a text file. Raises SceneError when it cannot be read."""
     try:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from heatsplat.contracts import SceneError, check_option
-from heatsplat.datamodules.side_files import json_object, read_text, shortened
+from heatsplat.datamodules.side_files import found_file, json_object, read_text, shortened
 
 Positions = tuple[list[int], list[int]]
 
@@ -91,8 +91,6 @@ def by_list(names: Sequence[str], path: Path) -> Positions:
 
     Names may be given with or without their folder and extension.
     """
-    if not path.is_file():
-        raise SceneError(f"data.split_file: there is no file {path}")
     if path.suffix.lower() == ".json":
         lists = json_object(path)
         if "test" not in lists:
@@ -130,16 +128,19 @@ class SplitRule:
     Args:
         rule: every_8th, quarter_centre, block, names, folders, json (what the data set itself lists) or list.
         fraction, position: of ``block``.
-        file: of ``list``.
+        file: of ``list``, relative to ``folder`` or the working directory.
+        folder: of the scene; None where it has none.
 
     Raises:
-        SceneError: the rule is unknown, or ``block`` or ``list`` lacks what it needs: before any image is read.
+        SceneError: the rule is unknown, ``block`` or ``list`` lacks what it needs, or another rule has a file: before any image
+            is read.
     """
 
     rule: str
     fraction: float = 0.125
     position: float = 0.5
-    file: Path | None = None
+    file: str | Path | None = None
+    folder: Path | None = None
 
     RULES = ("every_8th", "quarter_centre", "block", "names", "folders", "json", "list")
 
@@ -152,6 +153,10 @@ class SplitRule:
             )
         if self.rule == "list" and self.file is None:
             raise SceneError("data.split=list needs data.split_file: a file with one test name per line")
+        if self.rule != "list" and self.file is not None:
+            raise SceneError(
+                f"data.split_file={self.file} has no effect with data.split={self.rule}: add data.split=list, or leave it out"
+            )
 
     def __call__(self, names: Sequence[str], order: Sequence[int], subsets: Sequence[str | None]) -> Positions:
         """(train, test) positions. Raises SceneError when the rule leaves one of the two empty."""
@@ -162,7 +167,7 @@ class SplitRule:
             "names": lambda: by_name(names),
             "folders": lambda: by_subset(subsets) if any(subsets) else by_folder(names),
             "json": lambda: by_subset(subsets),
-            "list": lambda: by_list(names, self.file),
+            "list": lambda: by_list(names, found_file("data.split_file", self.file, self.folder)),
         }
         train, test = rules[self.rule]()
         if not train or not test:

@@ -95,10 +95,8 @@ def times_from_csv(path: Path, name_column: str, time_column: str) -> dict[str, 
     """Seconds by file, named as in the table; the time column holds seconds or ISO 8601 date-times.
 
     Raises:
-        SceneError: no such file or column, a cell that is neither, or two times of one file.
+        SceneError: no such column, a cell that is neither, or two times of one file.
     """
-    if not path.is_file():
-        raise SceneError(f"data.time_csv: there is no file {path}")
     table = read_table(path)
     for key, column in (("time_csv_name", name_column), ("time_csv_time", time_column)):
         if column not in table.columns:

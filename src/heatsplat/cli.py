@@ -232,8 +232,19 @@ def _write_down(config: DictConfig, hydra_config: DictConfig, folder: Path) -> N
         write_atomically(folder / f"{name}.yaml", OmegaConf.to_yaml(content))
 
 
+def check_unfinished(config: DictConfig, output_dir: Path) -> None:
+    """Raises OccupiedError where a folder holds checkpoints of an unfinished run with other settings (``resume.check_own``)."""
+    if (output_dir / METRICS_FILE).exists() or not any((output_dir / "checkpoints").glob("*.ckpt")):
+        return  # ``train_in`` compares results
+    with loading():
+        from heatsplat.runs.checks import checked
+        from heatsplat.runs.resume import check_own
+
+    check_own(checked(plain(config, HydraConfig.get().overrides.task)), output_dir)
+
+
 @_command
-@_job
+@functools.partial(_job, check=check_unfinished)
 def train(config: dict[str, Any], output_dir: Path) -> float | None:
     """Trains a method on a scene, tests it and writes the report. Returns the test PSNR, for sweepers."""
     with loading():

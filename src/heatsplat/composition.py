@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError
 
 from heatsplat import CHECKOUT
+from heatsplat.io.results import checkpoint_of
 from heatsplat.io.settings import at, walk
 from heatsplat.training.machine import cores
 
@@ -181,10 +182,10 @@ def followed(config: Any, before: Any, after: Any) -> Any:
 
 
 def run_of(ckpt: str | None) -> str:
-    """Folder of the run that wrote a checkpoint; what is made of the checkpoint goes there."""
+    """Folder of the run that wrote a checkpoint, which may be that folder; what is made of the checkpoint goes there."""
     if ckpt is None:
         return str(ROOT / "outputs")
-    folder = Path(ckpt).expanduser().resolve().parent
+    folder = checkpoint_of(ckpt).resolve().parent
     return str(folder.parent if folder.name == "checkpoints" else folder)
 
 

@@ -1,5 +1,7 @@
 """Where the times of images come from, and which of several places counts."""
 
+from pathlib import Path
+
 import pytest
 
 from heatsplat.contracts import SceneError
@@ -48,5 +50,7 @@ def test_a_table_that_lacks_an_image_is_refused(folder):
         SceneError, match=r"clock.csv has no row for a_030.png \(1 of 3 images\); column name must hold"
     ):
         told.of(folder, (*NAMES, "a_030.png"))
-    with pytest.raises(SceneError, match="there is no file"):
+    with pytest.raises(
+        SceneError, match=f"data.time_csv=other.csv: there is no file {folder}/other.csv and no {Path.cwd()}/other.csv"
+    ):
         FrameTimes(time_csv="other.csv").of(folder, NAMES)

@@ -3,6 +3,7 @@ import json
 import pytest
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.splits import SplitRule, block, by_folder, by_list, by_name, every_nth, quarter_centre
 
 
@@ -69,8 +70,25 @@ def test_lists_name_the_frame_that_does_not_exist(tmp_path):
     (tmp_path / "test.txt").write_text("9.png\n")
     with pytest.raises(SceneError, match=r"test.txt lists '9.png', which is no frame.*'1.png'"):
         by_list(["1.png"], tmp_path / "test.txt")
-    with pytest.raises(SceneError, match="there is no file"):
-        by_list(["1.png"], tmp_path / "none.txt")
+
+
+def test_lists_are_looked_for_in_the_scene_and_then_in_the_working_directory(tmp_path, monkeypatch):
+    here, scene = tmp_path / "here", tmp_path / "data" / "flight"
+    here.mkdir()
+    scene.mkdir(parents=True)
+    monkeypatch.chdir(here)
+    module = Colmap(root=str(tmp_path / "data"), scene="flight", split="list", split_file="test.txt")
+    asked = (["1.png", "2.png"], [0, 1], [None, None])
+    with pytest.raises(
+        SceneError, match=f"split_file=test.txt: there is no file {scene}/test.txt and no {here}/test.txt"
+    ):
+        module.split(*asked)
+    (here / "test.txt").write_text("1.png")
+    assert module.split(*asked) == ([1], [0])
+    (scene / "test.txt").write_text("2.png")
+    assert module.split(*asked) == ([0], [1])
+    whole = SplitRule("list", file=here / "test.txt", folder=scene)
+    assert whole(*asked) == ([1], [0])
 
 
 def test_rules_that_leave_nothing_to_train_or_test_are_refused():
@@ -85,3 +103,7 @@ def test_what_is_no_split_is_refused_before_anything_is_read():
         SplitRule("thirds")
     with pytest.raises(SceneError, match="data.split=list needs data.split_file"):
         SplitRule("list")
+    with pytest.raises(
+        SceneError, match="data.split_file=a.txt has no effect with data.split=block: add data.split=list"
+    ):
+        SplitRule("block", file="a.txt")

@@ -83,5 +83,3 @@ def test_a_table_names_missing_columns_and_bad_cells(tmp_path):
         times_from_csv(table, "file", "when")
     with pytest.raises(SceneError, match="line 2: 'soon' in column s is neither seconds nor a date-time"):
         times_from_csv(table, "file", "s")
-    with pytest.raises(SceneError, match="data.time_csv: there is no file"):
-        times_from_csv(tmp_path / "no.csv", "file", "s")

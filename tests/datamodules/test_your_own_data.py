@@ -39,8 +39,7 @@ def test_every_example_is_tried():
 def test_the_colmap_example(tmp_path):
     write_colmap(tmp_path, FILES)
     put(tmp_path, "temperature_bounds.json", "times.csv", "split.json")
-    split_file = str(tmp_path / "split.json")
-    scene = Colmap(root=str(tmp_path), time_csv="times.csv", split="list", split_file=split_file).scene
+    scene = Colmap(root=str(tmp_path), time_csv="times.csv", split="list", split_file="split.json").scene
     assert (scene.thermal_range.min_c, scene.thermal_range.max_c) == (12.5, 48.0)
     assert scene.train.times_s == [0.0, 2.5] and scene.test.times_s == [5.0]
     assert [f.name for f in scene.test.frames] == FILES[2:]

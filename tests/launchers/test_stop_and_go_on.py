@@ -8,6 +8,7 @@ from hydra.core.utils import JobStatus
 from running import TINY, compose_run, run
 
 from heatsplat import composition
+from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import resumed
 from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, _died
 
@@ -46,10 +47,22 @@ def test_a_run_goes_on_from_the_newest_checkpoint_that_can_be_read_and_is_not_th
     assert resumed(given, tmp_path) == given
 
 
-def test_a_run_with_other_settings_starts_from_the_beginning_and_says_so(tmp_path, caplog):
+def test_a_stopped_run_is_not_overwritten_by_one_of_other_settings(tmp_path):
     stored(tmp_path, "last.ckpt", 4, configured("optim.means=1e-3"))
-    assert resumed(configured(), tmp_path) == configured()
-    assert "has other settings (optim.means); starting from the beginning" in caplog.text
+    told = r"unfinished run with other settings \(optim.means\), of which last.ckpt is of step 4: .*run.dir.*ckpt=.*/last.ckpt"
+    for ckpt in (None, str(tmp_path / "elsewhere" / "checkpoints" / "last.ckpt")):
+        with pytest.raises(OccupiedError, match=told):
+            resumed(configured() | {"ckpt": ckpt}, tmp_path)
+    with pytest.raises(OccupiedError, match=r"\(\S+, \S+, \S+, \S+, \S+ and \d+ more\)"):
+        resumed(configured("method=etgs", "optim.means=1e-3"), tmp_path)
+
+
+def test_a_run_of_more_steps_goes_on_in_the_folder_of_the_shorter_one(tmp_path):
+    stored(tmp_path, "last.ckpt", 8, configured())
+    ckpt = tmp_path / "checkpoints" / "last.ckpt"
+    assert resumed(configured("max_steps=16", f"ckpt={ckpt}"), tmp_path)["ckpt"] == str(ckpt)
+    with pytest.raises(OccupiedError, match="max_steps"):
+        resumed(configured("max_steps=16"), tmp_path)
 
 
 def test_a_job_whose_process_died_says_so_in_its_folder(tmp_path):

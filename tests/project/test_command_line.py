@@ -9,6 +9,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -110,6 +111,17 @@ def test_evaluate_needs_the_checkpoint_only_and_agrees_with_training(finished, t
     (again,) = finished.glob("evaluations/*/metrics.json")
     first, second = (json.loads(path.read_text())["test"] for path in (finished / "metrics.json", again))
     assert first["psnr"] == second["psnr"] and first["mae_c"] == second["mae_c"]
+
+
+def test_a_stopped_run_stays_as_it_is_where_other_settings_are_given(finished, told, tmp_path):
+    for name in ("checkpoints", ".hydra"):
+        shutil.copytree(finished / name, tmp_path / name)
+    before = {path: path.read_bytes() for path in tmp_path.glob("*/*")}
+    others = ("optim.means=1e-3", f"hydra.run.dir={tmp_path}")
+    output = told("train", "method=etgs", *TINY, *others, cwd=tmp_path, code=1)
+    assert f"{tmp_path} holds an unfinished run with other settings (optim.means)" in " ".join(output.split())
+    assert len(before) > 4 and before == {path: path.read_bytes() for path in tmp_path.glob("*/*")}
+    assert not (tmp_path / "FAILED").exists()
 
 
 def test_evaluate_keeps_what_a_run_has_measured(finished):

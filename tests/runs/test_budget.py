@@ -29,6 +29,7 @@ from heatsplat.runs.curves import (
     read_points,
     write_points,
 )
+from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import resumed
 from heatsplat.runs.run import begin
 from heatsplat.training.module import SplatTraining
@@ -459,11 +460,16 @@ def test_a_budget_needs_the_clock_of_the_costs():
         a_clock().on_train_start(trainer, None)
 
 
-def left_by(folder: Path, config: dict, step: int, end: float) -> dict:
-    """The configuration of a run in a folder with one checkpoint, of a run whose schedule ends at ``end``."""
+def leave(folder: Path, config: dict, step: int, end: float) -> None:
+    """Puts a checkpoint into a folder, of a run whose schedule ends at ``end``."""
     (folder / "checkpoints").mkdir(parents=True)
     stored = {"config": config, "schedule": {"end": end}}
     torch.save({"global_step": step, "heatsplat": stored}, folder / "checkpoints" / "last.ckpt")
+
+
+def left_by(folder: Path, config: dict, step: int, end: float) -> dict:
+    """The configuration of a run that goes on in a folder with one checkpoint (``leave``)."""
+    leave(folder, config, step, end)
     return resumed(config, folder)
 
 
@@ -567,7 +573,9 @@ def test_a_stretched_run_that_died_goes_on_from_its_newest_checkpoint(tmp_path, 
     told = again.results.run["budget"]
     assert told["train_s"] + told["calibration_s"] == pytest.approx(3.0, rel=0.03)
     assert again.trainer.global_step == pytest.approx(planned / 0.5, rel=0.1)
-    assert prepared(tmp_path)["ckpt"] != str(tmp_path / "checkpoints" / "last.ckpt")  # which is of the end
+    before_end = prepared(tmp_path)
+    assert Path(before_end["ckpt"]).name.startswith("step_")  # last.ckpt is of the end
+    assert before_end["budget"] == plain["budget"]
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -587,9 +595,10 @@ def test_a_budget_is_planned_from_the_curves_that_it_is_pointed_at(tmp_path, mon
     assert other["budget_curves"] == str(tmp_path / "curves.csv")
     with pytest.raises(SceneError, match="none.csv holds no curves: FileNotFoundError.*budget_curves=FILE"):
         planned("budget_curves=none.csv")
-    left_by(tmp_path, other, 50, 100.0)  # its plan is kept by a run that is planned from the same curves only
+    leave(tmp_path, other, 50, 100.0)  # its plan is kept by a run that is planned from the same curves only
     assert planned("budget_curves=curves.csv")["budget"] == other["budget"]
-    assert planned()["budget"]["decay"] != 0.4
+    with pytest.raises(OccupiedError, match=r"other settings \(budget_curves\)"):
+        planned()
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -610,7 +619,7 @@ def test_a_run_has_the_settings_of_its_plan(tmp_path, monkeypatch):
         assert density["_target_"].endswith("Budget") and not {"grad_threshold", "reset_every"} & density.keys()
         assert density["stop"] == round(0.48 * config["max_steps"]) and density["cap_max"] == 100_000
     assert config["module"]["resolution"]["_target_"].endswith("CoarseToFine")
-    left_by(tmp_path, config, 50, 100.0)
+    leave(tmp_path, config, 50, 100.0)
     again = prepared(tmp_path, f"budget_curves={tmp_path}/curves.csv", settings=SIGHTED)
     assert again["density"] == config["density"] and again["budget"] == config["budget"]
     clock = BudgetClock(config["budget"], "")

@@ -1,6 +1,7 @@
 """The steps that make a run's configuration ready, and the Python interface around them."""
 
 import math
+import shutil
 from dataclasses import replace
 
 import hydra
@@ -10,7 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from running import TINY
 
 import heatsplat
-from heatsplat.composition import build
+from heatsplat.composition import build, run_of
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.runs.checks import checked
@@ -204,7 +205,7 @@ def test_clipping_and_a_plateau_are_settings_that_are_learned_by(trained):
 def test_a_checkpoint_of_another_scene_or_image_size_is_refused_with_both(trained, changed):
     """Of a folder elsewhere (data.root) only its scene tells."""
     folder, _, _ = trained
-    config = went_on(folder)
+    config = went_on(folder, "max_steps=9")
     there = build(heatsplat.compose([*QUICK, changed])["data"]).scene
     with pytest.raises(SceneError, match=r"was trained on static in \d+ x \d+ pixels, and this is (static|cooling) in"):
         on_scene(config, there)
@@ -241,6 +242,29 @@ def test_a_checkpoint_goes_on_for_longer_with_all_that_follows_from_the_length(t
     assert longer["ckpt"] and longer["optim"]["accumulate"] == 5 * config["optim"]["accumulate"]
 
 
+def test_a_checkpoint_of_the_last_step_or_a_later_one_is_refused_before_a_run_that_trains_nothing(trained):
+    for steps in (8, 5):
+        with pytest.raises(
+            SceneError,
+            match=rf"last.ckpt is of step 8 already, and max_steps={steps}: .*more max_steps, or evaluate it",
+        ):
+            went_on(trained[0], f"max_steps={steps}")
+    assert went_on(trained[0], "max_steps=9")["ckpt"]
+
+
+def test_the_folder_of_a_run_means_its_last_checkpoint(trained, tmp_path):
+    folder, _, _ = trained
+    last = folder / "checkpoints" / "last.ckpt"
+    for place in (folder, folder / "checkpoints", last):
+        assert run_of(str(place)) == str(folder.resolve())
+        assert heatsplat.load(place).checkpoint["global_step"] == 8
+        config = heatsplat.compose([*QUICK, f"ckpt={place}", "max_steps=9"])
+        assert resumed(checked(config), tmp_path)["ckpt"] == str(last)
+    shutil.copytree(folder, tmp_path / "run", ignore=shutil.ignore_patterns("last.ckpt"))
+    with pytest.raises(SceneError, match=rf"no checkpoint at {tmp_path}/run; there are: .*/step_000008.ckpt"):
+        heatsplat.load(tmp_path / "run")
+
+
 def test_settings_that_an_older_heatsplat_did_not_have_are_warned_of_unless_they_are_asked_for(
     trained, tmp_path, caplog
 ):
@@ -249,7 +273,7 @@ def test_settings_that_an_older_heatsplat_did_not_have_are_warned_of_unless_they
     for settings in (stored["heatsplat"]["config"], stored["heatsplat"]["config"]["module"]):
         settings["optim"] = {key: value for key, value in settings["optim"].items() if key != "averaged"}
     torch.save(stored, tmp_path / "old.ckpt")
-    assert resumed(heatsplat.compose([*QUICK, f"ckpt={tmp_path}/old.ckpt"]), tmp_path)["ckpt"]
+    assert resumed(heatsplat.compose([*QUICK, f"ckpt={tmp_path}/old.ckpt", "max_steps=9"]), tmp_path)["ckpt"]
     assert "old.ckpt is of an older heatsplat without optim.averaged: they count from here on" in caplog.text
     with pytest.raises(SceneError, match="was trained with another optim.averaged"):
         resumed(heatsplat.compose([*QUICK, f"ckpt={tmp_path}/old.ckpt", "optim.averaged=0.2"]), tmp_path)

@@ -14,6 +14,7 @@ from heatsplat.effects import assembly
 from heatsplat.effects.base import Verdict
 from heatsplat.io.results import RunResults
 from heatsplat.runs.checks import checked
+from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import resumed
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.session import restore
@@ -101,9 +102,10 @@ def test_a_checkpoint_is_enough_without_looking_at_the_scene_again(scene_says, t
         with pytest.raises(SceneError, match=f"step_000003.ckpt was trained with another {other.partition('=')[0]}"):
             run(tmp_path / "other", *overrides, f"ckpt={half}", other)
     last.unlink()  # as if it had been stopped after step 3
-    for more, goes_on in (((), True), (("effects.agc=off",), False)):
-        config = resumed(checked(compose([*overrides, *more])), tmp_path / "whole")
-        assert (config["ckpt"] is not None) == ("verdicts" in config) == goes_on
+    config = resumed(checked(compose(overrides)), tmp_path / "whole")
+    assert config["ckpt"] is not None and "verdicts" in config
+    with pytest.raises(OccupiedError, match=r"unfinished run with other settings \(effects.agc\)"):
+        resumed(checked(compose([*overrides, "effects.agc=off"])), tmp_path / "whole")
 
 
 def test_what_the_choice_would_replace_is_refused(scene_says, tmp_path):

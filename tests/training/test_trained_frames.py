@@ -67,6 +67,15 @@ def test_what_is_right_goes_on(ckpt, tmp_path):
     assert load(ckpt, {"root": str(tmp_path / "data")}).scene.train.frames
 
 
+def test_a_run_whose_test_views_were_listed_is_looked_at_with_another_split(ckpt, tmp_path):
+    stored = load_checkpoint(ckpt)
+    stored["heatsplat"]["config"]["data"] |= {"split": "list", "split_file": "list.txt"}
+    CheckpointFiles().save_checkpoint(stored, tmp_path / "listed.ckpt")
+    assert load(tmp_path / "listed.ckpt", {"split": "block"}).data.split.rule == "block"
+    with pytest.raises(SceneError, match="data.split_file=list.txt: there is no file"):
+        load(tmp_path / "listed.ckpt")
+
+
 def test_other_cameras_are_refused_with_how_far_they_moved(ckpt, tmp_path):
     moved = write_scene(tmp_path / "moved", turn=0.1)
     with pytest.raises(

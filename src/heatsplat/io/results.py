@@ -17,8 +17,16 @@ from heatsplat.metrics.definitions import COSTS, DEFINITIONS
 METRICS_FILE = "metrics.json"
 CURVE_FILE = "curve.csv"  # its validations
 FAILED = "FAILED"  # why it has no results
+LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
 
 SECTIONS = ("run", "test", "cost", "effects", "data", "versions", "definitions")
+
+
+def checkpoint_of(path: str | Path) -> Path:
+    """The file that a checkpoint's path means: the last checkpoint where it is a run's folder, or its folder of checkpoints."""
+    path = Path(path).expanduser()
+    lasts = (path / LAST_CHECKPOINT, path / LAST_CHECKPOINT.name)
+    return next((last for last in lasts if last.is_file()), path)
 
 
 @dataclass

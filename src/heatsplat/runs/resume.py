@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from heatsplat.composition import compose, followed, overlap
+from heatsplat.composition import compose, followed, overlap, run_of
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
 from heatsplat.io.command_lines import keys_of
+from heatsplat.io.results import checkpoint_of
 from heatsplat.io.settings import at
+from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.trust import trusted
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.module import CHECKPOINT_KEY
@@ -27,6 +30,7 @@ LEARNED = {  # and what in these says how it learns, or how long
 # What may differ beside the length from the run whose checkpoint is given: where it is, when it ends, what is decided already.
 OPEN = ("data.root.", "renderer.backend.", "callbacks.plateau.", "effects.price.", "effects.least_db_per_ms.")
 ABSENT = object()  # of what an older heatsplat did not have
+SHOWN = 5  # names of settings in a message
 
 
 def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
@@ -40,21 +44,39 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
         output_dir: folder of the run.
 
     Raises:
-        SceneError: the checkpoint that was given is none, or of a run with another budget or other settings than its length.
+        SceneError: the checkpoint that was given is none, of a run with another budget or other settings than its length, or of
+            the last step of this run or a later one.
+        OccupiedError: as ``check_own``.
     """
     if config["ckpt"] is not None:
-        return _continued(config, stored_config(load_checkpoint(config["ckpt"])))
+        config = config | {"ckpt": str(checkpoint_of(config["ckpt"]))}
+        check_own(config, output_dir)
+        return _continued(config, load_checkpoint(config["ckpt"]))
+    composed = config  # of which the plan of an earlier budget is no part
     for path, checkpoint in checkpoints_in(output_dir):
         stored = stored_config(checkpoint)
-        changed = differences(config, stored)
-        if changed:
-            log.warning("%s has other settings (%s); starting from the beginning", path, ", ".join(changed))
-            break
+        _check_own(composed, output_dir, path, checkpoint)
         config = config | _measured(stored, path, "verdicts", "choosing_seconds", "budget")
         if checkpoint["global_step"] < planned_end(checkpoint):
             log.info("going on from step %d of %s", checkpoint["global_step"], path)
             return config | {"ckpt": str(path)}
     return config
+
+
+def check_own(config: dict[str, Any], output_dir: Path) -> None:
+    """Nothing where a run's folder has no checkpoints, or its newest has the same settings, or the run goes on from one of them.
+
+    Args:
+        config: as composed and checked.
+        output_dir: folder of the run.
+
+    Raises:
+        OccupiedError: its checkpoints are of a run with other settings and would be overwritten.
+    """
+    if config["ckpt"] is not None and Path(run_of(config["ckpt"])) == output_dir.resolve():
+        return  # ``_continued`` compares the settings, and allows more steps
+    for path, checkpoint in islice(checkpoints_in(output_dir), 1):
+        _check_own(config, output_dir, path, checkpoint)
 
 
 def on_scene(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
@@ -117,6 +139,17 @@ def stored_config(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     return config if isinstance(config, dict) else {}
 
 
+def _check_own(config: dict[str, Any], output_dir: Path, path: Path, checkpoint: Mapping[str, Any]) -> None:
+    """Raises OccupiedError where a checkpoint in a run's folder is of other settings."""
+    if changed := differences(config, stored_config(checkpoint)):
+        more = f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else ""
+        raise OccupiedError(
+            f"{output_dir} holds an unfinished run with other settings ({', '.join(changed[:SHOWN])}{more}), of which "
+            f"{path.name} is of step {checkpoint.get('global_step')}: give another folder with hydra.run.dir; or go on with that "
+            f"run, with its settings and ckpt={path}; or delete that folder"
+        )
+
+
 def _measured(stored: Mapping[str, Any], path: Path | str, *keys: str) -> dict[str, Any]:
     """What an earlier run found out, of which the parts of this one will be built."""
     return trusted({key: stored[key] for key in keys if key in stored}, path)
@@ -130,8 +163,9 @@ def _differing(key: str, one: Any, other: Any) -> Iterator[str]:
         yield key
 
 
-def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
+def _continued(config: dict[str, Any], checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration with what was measured for the run of the checkpoint that it was given."""
+    stored = stored_config(checkpoint)
     ckpt, asked, plan = config["ckpt"], config["budget"], stored.get("budget")
     if asked is not None and plan is None:
         raise SceneError(f"{ckpt} was trained without a budget and keeps its schedule: leave budget out")
@@ -142,6 +176,8 @@ def _continued(config: dict[str, Any], stored: Mapping[str, Any]) -> dict[str, A
     config = config | _measured(stored, ckpt, "budget", "scene")
     if assembly.chooses_effects(config):
         config = config | _measured(stored, ckpt, "verdicts", "choosing_seconds")
+    if stored.get("name") == config["name"]:
+        _check_steps_left(config, checkpoint)
     return config
 
 
@@ -168,3 +204,16 @@ def _check_same_settings(config: dict[str, Any], stored: Mapping[str, Any]) -> N
         )
     if new:
         log.warning("%s is of an older heatsplat without %s: they count from here on", config["ckpt"], ", ".join(new))
+
+
+def _check_steps_left(config: Mapping[str, Any], checkpoint: Mapping[str, Any]) -> None:
+    """Raises SceneError where a run would end at the step of its checkpoint or before, and would train nothing."""
+    planned = config["budget"] is not None
+    step, end = checkpoint["global_step"], planned_end(checkpoint) if planned else config["max_steps"]
+    if step >= end:
+        ends = f"the plan of its budget ends at step {end}" if planned else f"max_steps={end}"
+        more = "" if planned else "give more max_steps, or "
+        raise SceneError(
+            f"{config['ckpt']} is of step {step} already, and {ends}: nothing is left to train; {more}evaluate it "
+            f"(src/evaluate.py ckpt={config['ckpt']})"
+        )

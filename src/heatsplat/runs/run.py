@@ -22,7 +22,7 @@ from heatsplat.composition import build, scene_name
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_option
 from heatsplat.doctor.examination import FINDINGS_FILE, warn_of, write_findings
 from heatsplat.geometry.coverage import Sighting, covered
-from heatsplat.io.results import RunResults
+from heatsplat.io.results import RunResults, checkpoint_of
 from heatsplat.runs.budget import budgeted
 from heatsplat.runs.checks import check_last_stage, checked
 from heatsplat.runs.declared import declared
@@ -241,7 +241,7 @@ def load(
     """The trained scene of a checkpoint, on the clock and with the bounds of its run (``training.scales``).
 
     Args:
-        checkpoint: such as outputs/<run>/checkpoints/last.ckpt.
+        checkpoint: such as outputs/<run>/checkpoints/last.ckpt; outputs/<run> means that file.
         data: settings of the data that differ from training, such as {"root": "/elsewhere"}; None keeps a setting, "null" is
             none.
         weather: table of another weather for the scene's place and times.
@@ -256,6 +256,7 @@ def load(
     """
     if checkpoint is None:
         raise SceneError("which checkpoint? Give ckpt=outputs/<run>/checkpoints/last.ckpt")
+    checkpoint = checkpoint_of(checkpoint)
     loaded = load_checkpoint(checkpoint)
     config = trusted(stored_config(loaded), checkpoint, _names(trust))
     if not {"module", "data"} <= config.keys():
@@ -263,6 +264,8 @@ def load(
     changed = {key: None if value == "null" else value for key, value in (data or {}).items() if value is not None}
     if "root" in changed:
         changed["root"] = str(Path(changed["root"]).expanduser().resolve())
+    if changed.get("split", "list") != "list" and config["data"].get("split_file"):
+        changed = {"split_file": None} | changed  # which belongs to the rule of training
     if "weather" in changed and "weather" not in config["data"]:
         raise SceneError(f"data.weather={changed['weather']}: the data set of this checkpoint has no weather to choose")
     with _naming(checkpoint):

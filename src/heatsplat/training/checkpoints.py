@@ -14,6 +14,7 @@ from pytorch_lightning.plugins.io import CheckpointIO
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.files import write_atomically
+from heatsplat.io.results import checkpoint_of
 
 
 class CheckpointFiles(CheckpointIO):
@@ -47,10 +48,13 @@ class CheckpointFiles(CheckpointIO):
 def load_checkpoint(path: str | Path) -> dict[str, Any]:
     """The checkpoint as a dict of tensors and plain containers; nothing in it is executed.
 
+    Args:
+        path: of the file; a run's folder, or its folder of checkpoints, for its last one.
+
     Raises:
         SceneError: there is none at ``path``, or it was damaged or holds anything else, with the others in its folder.
     """
-    path = Path(path)
+    path = checkpoint_of(path)
     there = sorted(str(p) for p in path.parent.glob("*.ckpt")) or sorted(str(p) for p in path.rglob("*.ckpt"))
     others = [other for other in there if other != str(path)]
     remedy = f"; there are: {', '.join(others)}" if others else ""

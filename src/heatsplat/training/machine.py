@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 # Lightning's remarks that no user can act on: workers, its products, a deprecation of torch, checkpoints of another
-# folder, SLURM where a run was started by hand, loaders that cannot resume (ours takes the step from the trainer, so
-# a resumed run sees the right views), runs without validation, and schedules that go on while gradients wait.
+# folder or with other callbacks, SLURM where a run was started by hand, loaders that cannot resume (ours takes the step
+# from the trainer, so a resumed run sees the right views), runs without validation, and schedules that go on while
+# gradients wait.
 NOISE = (
     r".*does not have many workers.*",
     r".*LeafSpec.*",
@@ -20,6 +21,7 @@ NOISE = (
     r".*transfer_batch_to.*",
     r".*smaller than the logging interval.*",
     r".*dirpath has changed.*",
+    r".*callbacks used to create the checkpoint need.*",
     r".*dataloader is not resumable.*",
     r".*`srun` command is available.*",
     r".*but have no `val_dataloader`.*",
