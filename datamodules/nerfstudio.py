@@ -34,6 +34,7 @@ from heatsplat.datamodules.formats.nerfstudio import (
 )
 from heatsplat.datamodules.frame_times import FrameTimes
 from heatsplat.datamodules.points import ply_points, random_points, told_random
+from heatsplat.datamodules.posed_frames import told_missing
 from heatsplat.datamodules.side_files import shortened
 from heatsplat.datamodules.splits import TEST_WORDS, TRAIN_WORDS, SplitRule
 
@@ -191,8 +192,7 @@ class Nerfstudio(SceneDataModule):
                 f"none of the {len(entries)} frames of {next(iter(listed)).path} has a thermal image in {folder}: "
                 f"looked for {missing[0]} under thermal_file_path and in thermal/"
             )
-        if missing:
-            notes["images_missing"] = f"{len(missing)} frames have no thermal image, dropped: {', '.join(missing[:5])}"
+        notes |= told_missing(missing, len(entries), "a thermal image", folder)
         if self.rgb:
             notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
         times, notes["time_source"] = self._times(folder, written, [*listed][0])
