@@ -279,7 +279,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
         uncertainty = Uncertainty(trained.module)
         uncertain = {"deviation": uncertainty.deviation, "widest": uncertainty.widest}
     files = ShotFiles(output_dir, **kinds)
-    written = write_shot(images, frames, trained.scene, files, config["range_c"], **uncertain)
+    written = write_shot(images, frames, trained.scene, files, config["range_c"], trained.image_titles, **uncertain)
     log.info("%d frames, %d files in %s", len(frames), len(written), output_dir)
 
 
