@@ -90,7 +90,9 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
     if lens.is_distorted:
         pixels, mask = undistorted(pixels, lens), undistorted_mask(mask, lens)
         rgb = None if rgb is None else undistorted(rgb, lens)
-    small = (max(1, round(width / options.downscale)), max(1, round(height / options.downscale)))
+    small = (width, height)
+    if options.downscale > 1:
+        small = tuple(_shrunk(side / options.downscale, options.multiple) for side in (width, height))
     pixels = resized(pixels, *small)
     rgb = None if rgb is None else np.ascontiguousarray(resized(rgb, *small))
     mask = None if mask is None else resized_mask(mask, *small)
@@ -99,6 +101,11 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
     if frame.read is None:
         return PreparedImage(None, np.ascontiguousarray(pixels), mask, lens.resized(*small), found, colour=0.0)
     return PreparedImage(np.ascontiguousarray(pixels), rgb, mask, lens.resized(*small), found, colour)
+
+
+def _shrunk(side: float, multiple: int) -> int:
+    """The whole number of pixels, a multiple, that is nearest to a side."""
+    return max(1, round(side / multiple)) * multiple
 
 
 def _squeezed(width: int, height: int, lens: Lens) -> float:

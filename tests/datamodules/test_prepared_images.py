@@ -45,6 +45,15 @@ def shaped(width, height, lens=LENS):
     return prepare(frame, SceneOptions(SplitRule("every_8th")))
 
 
+@pytest.mark.parametrize(("downscale", "size"), [(1.0, (52, 66)), (4.0, (12, 16)), (1.1, (48, 60)), (50.0, (4, 4))])
+def test_images_that_shrink_can_be_divided(downscale, size):
+    lens = Lens(fx=60.0, fy=60.0, cx=33.0, cy=26.0, width=66, height=52)
+    frame = RawFrame("a.png", np.eye(4), lens, lambda: np.zeros((52, 66), np.uint8))
+    found = prepare(frame, SceneOptions(SplitRule("every_8th"), downscale, multiple=4))
+    assert found.thermal.shape == size and (found.lens.height, found.lens.width) == size
+    assert found.lens.fx == pytest.approx(60.0 * size[1] / 66) and found.lens.cy == pytest.approx(size[0] / 2)
+
+
 @pytest.mark.parametrize(("width", "height"), [(512, 640), (320, 240), (640, 480)])
 def test_an_image_of_another_shape_than_its_camera_is_refused(width, height):
     lens = Lens(fx=600.0, fy=600.0, cx=320.0, cy=256.0, width=640, height=512)
