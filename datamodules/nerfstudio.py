@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from heatsplat.contracts import SceneData, SceneError, ThermalRange
+from heatsplat.contracts import SceneData, SceneError, ThermalRange, counted
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, read_bounds
 from heatsplat.datamodules.file_names import same_files
@@ -110,7 +110,9 @@ class Nerfstudio(SceneDataModule):
         frames, found = self._frames(folder, listed, bounds)
         if self.split.rule in ("names", "json") and any(f.subset for f in frames):
             if unlisted := [f.name for f in frames if not f.subset]:
-                found["images_unlisted"] = f"{len(unlisted)} frames are in no list, dropped: {', '.join(unlisted[:5])}"
+                found["images_unlisted"] = (
+                    f"{counted(len(unlisted), 'frame')} in no list, dropped: {', '.join(unlisted[:5])}"
+                )
                 log.warning("scene %s: %s of %s", folder.name, found["images_unlisted"], first.path.name)
             frames = [f for f in frames if f.subset]
         points, colors, origin = self._points(folder, first, frames)

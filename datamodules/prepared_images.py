@@ -231,12 +231,12 @@ def image_notes(prepared: Mapping[int, PreparedImage], downscale: float) -> dict
         else:
             log.info("%s", notes["intrinsics_rescaled"])
     if distorted := sum(f["distorted"] for f in found):
-        notes["distortion"] = f"{distorted} images undistorted onto a pinhole of the same focal length"
+        notes["distortion"] = f"{counted(distorted, 'image')} undistorted onto a pinhole of the same focal length"
     if nan := sum(f["nan"] for f in found):
-        notes["nan_pixels"] = f"{nan} pixels are NaN, infinite or below absolute zero and masked"
-        log.warning("%d pixels are NaN, infinite or below absolute zero and masked", nan)
+        notes["nan_pixels"] = f"{counted(nan, 'pixel')} masked: NaN, infinite or below absolute zero"
+        log.warning("%s", notes["nan_pixels"])
     if rgb := sum(f["rgb_resized"] for f in found):
-        notes["rgb_resized"] = f"{rgb} visible images resized to the thermal grid"
+        notes["rgb_resized"] = f"{counted(rgb, 'visible image')} resized to the thermal grid"
     if masked := [p.mask for p in prepared.values() if p.mask is not None]:
         share = sum(int((~m).sum()) for m in masked) / sum(p.lens.width * p.lens.height for p in prepared.values())
         notes["masked_fraction"] = share
