@@ -26,6 +26,7 @@ from heatsplat.contracts import (
     ThermalRange,
     View,
     ViewSet,
+    counted,
     evenly_spread,
 )
 from heatsplat.datamodules.bounds import BOUNDS_FILE, MIN_CELSIUS, celsius
@@ -201,7 +202,7 @@ def _split(
         "val_views": f"{len(val)} of the test views, evenly spaced; they draw curves and select nothing",
     }
     if left_out := len(frames) - len(set(train) | set(test)):
-        notes["split_left_out"] = f"{left_out} frames are in neither list and are not used"
+        notes["split_left_out"] = f"{counted(left_out, 'frame')} in neither list, not used"
     return train, test, val
 
 
@@ -219,7 +220,9 @@ def _with_finite_points(raw: RawScene, notes: dict[str, Any]) -> RawScene:
     points = points[kept]
     notes["points"] = len(points)
     if len(points) < len(kept):
-        notes["points_dropped"] = f"{len(kept) - len(points)} points with NaN, infinite or absurdly large coordinates"
+        notes["points_dropped"] = (
+            f"{counted(len(kept) - len(points), 'point')} with NaN, infinite or absurdly large coordinates"
+        )
     if len(points) < 4:
         raise SceneError(
             f"scene {raw.name} has {len(points)} finite points, at least 4 are needed to start from; "
@@ -270,7 +273,9 @@ def _with_pseudo_colour(
             "has bounds. Point the loader at grey images, or train on the colours with data.thermal_channels=3 (no °C)."
         )
     if colour:
-        notes["pseudo_colour"] = f"{len(colour)} images are pseudo-colour; their luma is used and is no temperature"
+        notes["pseudo_colour"] = (
+            f"{counted(len(colour), 'image')} in pseudo-colour; the luma is used and is no temperature"
+        )
     return raw
 
 
@@ -325,8 +330,8 @@ def _in_order(frames: Sequence[RawFrame]) -> tuple[list[RawFrame], list[float] |
             )
     notes = {"duration_s": times[-1] - times[0]}
     if repeated := len(times) - len(set(times)):
-        notes["duplicate_times"] = f"{repeated} frames share their time with another one; all are kept"
-        log.warning("%d frames share their time with another one; all are kept", repeated)
+        notes["duplicate_times"] = f"{counted(repeated, 'frame')} with the time of another one; all are kept"
+        log.warning("%s", notes["duplicate_times"])
     return frames, times, notes
 
 

@@ -20,7 +20,7 @@ from heatsplat.contracts import SceneData, SceneError, check_option
 from heatsplat.datamodules.assemble import build_scene
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, split_alpha, to_grey
 from heatsplat.datamodules.formats.lens import Lens
-from heatsplat.datamodules.lowres import degraded
+from heatsplat.datamodules.lowres import Reduction, degraded
 from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
 from heatsplat.datamodules.splits import SplitRule
 from heatsplat.datamodules.weather import with_weather
@@ -174,7 +174,8 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         self, name: str, frames: Sequence[RawFrame], points: np.ndarray, split: SplitRule | None = None, **scene: Any
     ) -> SceneData:
         """``build_scene`` of a ``RawScene`` with this module's options."""
-        options = SceneOptions(split or self.split, self.downscale, self.thermal_channels, self.alpha_mask)
+        multiple = Reduction.parse(self.degrade).factor if self.degrade else 1
+        options = SceneOptions(split or self.split, self.downscale, self.thermal_channels, self.alpha_mask, multiple)
         return build_scene(RawScene(name, frames, points, **scene), options)
 
 

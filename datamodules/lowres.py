@@ -94,7 +94,7 @@ def _reduced_frame(frame: Frame, reduction: Reduction, degrade: str) -> Frame:
         remedy = f"factors that do: {', '.join(map(str, whole))}" if whole else "no factor up to 16 does"
         raise SceneError(
             f"data.degrade={degrade}: image {frame.name} has {width} x {height} pixels, which {reduction.factor} does "
-            f"not divide; {remedy}. data.downscale changes the size before."
+            f"not divide; {remedy}. data.downscale=1.1, or any above 1, makes images of a size that it divides."
         )
     return replace(frame, camera=frame.camera.resized(width // reduction.factor, height // reduction.factor))
 

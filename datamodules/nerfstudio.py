@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from heatsplat.contracts import SceneData, SceneError, ThermalRange
+from heatsplat.contracts import SceneData, SceneError, ThermalRange, counted
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, read_bounds
 from heatsplat.datamodules.file_names import same_files
@@ -34,6 +34,7 @@ from heatsplat.datamodules.formats.nerfstudio import (
 )
 from heatsplat.datamodules.frame_times import FrameTimes
 from heatsplat.datamodules.points import ply_points, random_points, told_random
+from heatsplat.datamodules.posed_frames import told_missing
 from heatsplat.datamodules.side_files import shortened
 from heatsplat.datamodules.splits import TEST_WORDS, TRAIN_WORDS, SplitRule
 
@@ -109,7 +110,9 @@ class Nerfstudio(SceneDataModule):
         frames, found = self._frames(folder, listed, bounds)
         if self.split.rule in ("names", "json") and any(f.subset for f in frames):
             if unlisted := [f.name for f in frames if not f.subset]:
-                found["images_unlisted"] = f"{len(unlisted)} frames are in no list, dropped: {', '.join(unlisted[:5])}"
+                found["images_unlisted"] = (
+                    f"{counted(len(unlisted), 'frame')} in no list, dropped: {', '.join(unlisted[:5])}"
+                )
                 log.warning("scene %s: %s of %s", folder.name, found["images_unlisted"], first.path.name)
             frames = [f for f in frames if f.subset]
         points, colors, origin = self._points(folder, first, frames)
@@ -191,8 +194,7 @@ class Nerfstudio(SceneDataModule):
                 f"none of the {len(entries)} frames of {next(iter(listed)).path} has a thermal image in {folder}: "
                 f"looked for {missing[0]} under thermal_file_path and in thermal/"
             )
-        if missing:
-            notes["images_missing"] = f"{len(missing)} frames have no thermal image, dropped: {', '.join(missing[:5])}"
+        notes |= told_missing(missing, len(entries), "a thermal image", folder)
         if self.rgb:
             notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
         times, notes["time_source"] = self._times(folder, written, [*listed][0])

@@ -62,15 +62,11 @@ class NTR(OutdoorDataModule):
                 "time_s": None if time is None else self.start_s + finite(time, f"{file}: time", "a number of seconds")
             }
 
-        frames, missing = listed_frames(self, folder, describe)
-        notes: dict[str, Any] = {
-            "registered": len(frames) + len(missing),
-            "cameras": "transforms_train.json and transforms_test.json, OpenCV axes",
+        frames, listed = listed_frames(self, folder, describe)
+        notes = listed | {
             "time_source": "key 'time' of the JSON files, seconds",
             "bounds_source": "data.min_c and data.max_c: the data set keeps them in its code",
         }
-        if missing:
-            notes["images_missing"] = f"{len(missing)} frames have no image, dropped: {', '.join(missing[:5])}"
         points, origin = mesh_points(folder, frames, self.random_points, self.seed)
         return self.finish(
             folder.name,

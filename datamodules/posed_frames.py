@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -9,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, counted
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.formats.colmap import SparseModel
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
 from heatsplat.datamodules.points import obj_vertices, random_points, told_random
+
+log = logging.getLogger(__name__)
 
 # Lists of frames by subset, in NTR's layout.
 FILES = {"train": "transforms_train.json", "test": "transforms_test.json"}
@@ -44,13 +47,29 @@ def match_model(
             f"has names like {model.names[0]!r}, the folder like {index.names[0]!r}"
         )
     notes: dict[str, Any] = {"registered": len(model.names)}
-    if missing := [name for name in model.names if files[name] is None]:
-        notes["images_missing"] = (
-            f"{len(missing)} registered images have no file in {folder}/, dropped: {_some(missing)}"
-        )
+    missing = [name for name in model.names if files[name] is None]
+    notes |= told_missing(missing, len(model.names), f"a file in {folder}/", index.folder)
     if unregistered := index.unused(f for f in files.values() if f):
-        notes["images_unregistered"] = f"{len(unregistered)} files are not in the model, unused: {_some(unregistered)}"
+        notes["images_unregistered"] = (
+            f"{counted(len(unregistered), 'file')} not in the model, unused: {_some(unregistered)}"
+        )
     return kept, notes
+
+
+def told_missing(missing: Sequence[str], count: int, lacking: str, folder: Path) -> dict[str, Any]:
+    """A note on frames that are left out because their image is not there, of which the log warns too; none without such.
+
+    Args:
+        missing: their names.
+        count: frames of the scene, those among them.
+        lacking: what they have none of, for the note.
+        folder: in which images were looked for.
+    """
+    if not missing:
+        return {}
+    note = f"{len(missing)} of {counted(count, 'frame')} without {lacking}, dropped: {_some(missing)}"
+    log.warning("%s: %s; put these images there, or take the frames out of the list of cameras", folder, note)
+    return {"images_missing": note}
 
 
 def model_frames(
@@ -95,8 +114,8 @@ def model_frames(
 
 def listed_frames(
     module: SceneDataModule, folder: Path, describe: Callable[[dict[str, Any], str], dict[str, Any]]
-) -> tuple[list[RawFrame], list[str]]:
-    """The frames of transforms_train.json and transforms_test.json that have an image, and the names of those without.
+) -> tuple[list[RawFrame], dict[str, Any]]:
+    """The frames of transforms_train.json and transforms_test.json that have an image, and notes on them and those without.
 
     Args:
         module: whose masks are looked up.
@@ -132,7 +151,9 @@ def listed_frames(
             )
     if not frames:
         raise SceneError(f"no frame of {folder / FILES['train']} has an image in {folder}: looked for {missing[0]}.png")
-    return frames, missing
+    count = len(frames) + len(missing)
+    notes = {"registered": count, "cameras": f"{' and '.join(FILES.values())}, OpenCV axes"}
+    return frames, notes | told_missing(missing, count, "an image", folder)
 
 
 def mesh_points(folder: Path, frames: Sequence[RawFrame], count: int, seed: int) -> tuple[np.ndarray, dict[str, Any]]:

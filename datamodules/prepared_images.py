@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, counted
 from heatsplat.datamodules.bounds import MAX_CELSIUS, MIN_CELSIUS
 from heatsplat.datamodules.formats.images import (
     colour_levels,
@@ -25,6 +26,10 @@ from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.raw_scene import RawFrame, SceneOptions
 
 log = logging.getLogger(__name__)
+
+# Share by which the sides of an image may differ in their scale from its camera's: those that COLMAP's undistorter trims
+# do by about a hundredth, 4:3 and 5:4 by 7 of them.
+MOST_SQUEEZED = 0.03
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,8 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
         "channels": ("L" if pixels.ndim == 2 else "RGB") + ("A" if alpha is not None else ""),
         "model": frame.lens.model,
         "distorted": frame.lens.is_distorted,
-        "rescaled": (frame.lens.width, frame.lens.height) != (width, height),
+        "camera": f"{frame.lens.width}x{frame.lens.height}",
+        "squeezed": _squeezed(width, height, frame.lens),
         "nan": 0,
         "rgb_resized": False,
     }
@@ -84,7 +90,9 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
     if lens.is_distorted:
         pixels, mask = undistorted(pixels, lens), undistorted_mask(mask, lens)
         rgb = None if rgb is None else undistorted(rgb, lens)
-    small = (max(1, round(width / options.downscale)), max(1, round(height / options.downscale)))
+    small = (width, height)
+    if options.downscale > 1:
+        small = tuple(_shrunk(side / options.downscale, options.multiple) for side in (width, height))
     pixels = resized(pixels, *small)
     rgb = None if rgb is None else np.ascontiguousarray(resized(rgb, *small))
     mask = None if mask is None else resized_mask(mask, *small)
@@ -93,6 +101,18 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
     if frame.read is None:
         return PreparedImage(None, np.ascontiguousarray(pixels), mask, lens.resized(*small), found, colour=0.0)
     return PreparedImage(np.ascontiguousarray(pixels), rgb, mask, lens.resized(*small), found, colour)
+
+
+def _shrunk(side: float, multiple: int) -> int:
+    """The whole number of pixels, a multiple, that is nearest to a side."""
+    return max(1, round(side / multiple)) * multiple
+
+
+def _squeezed(width: int, height: int, lens: Lens) -> float:
+    """By what share the two sides of an image differ in their scale from its camera's, beyond a pixel of each side that
+    rounding may take."""
+    differs = abs(math.log(width / lens.width * lens.height / height))
+    return max(0.0, differs - 1.0 / width - 1.0 / height)
 
 
 def _mask_of(frame: RawFrame, width: int, height: int) -> np.ndarray | None:
@@ -146,7 +166,8 @@ def _supported(pixels: np.ndarray, name: str) -> np.ndarray:
 
 
 def check_equals(prepared: Mapping[str, PreparedImage]) -> None:
-    """Raises SceneError for an image of another type than the others, or another size than those of its camera."""
+    """Raises SceneError for an image of another type than the others, another size than those of its camera, or another shape
+    than the camera."""
     cameras: dict[Any, list[tuple[str, PreparedImage]]] = {}
     for name, p in prepared.items():
         lens = p.lens
@@ -166,10 +187,18 @@ def check_equals(prepared: Mapping[str, PreparedImage]) -> None:
         most, count = sizes.most_common(1)[0]
         for name, p in frames:
             size = p.found["size"]
-            if size != most and count >= 3 and (sizes[size] == 1 or p.found["rescaled"]):
+            if size != most and count >= 3 and (sizes[size] == 1 or size != p.found["camera"]):
                 raise SceneError(
                     f"image {name} is {size}, but {count} others of the same camera are {most}; copy or export it again"
                 )
+    squeezed = [name for name, p in prepared.items() if p.found["squeezed"] > MOST_SQUEEZED]
+    if squeezed:
+        name, found = squeezed[0], prepared[squeezed[0]].found
+        raise SceneError(
+            f"image {name} is {found['size']}, but its camera is {found['camera']}, which has another shape "
+            f"({len(squeezed)} of {counted(len(prepared), 'image')} differ so); correct width and height of the camera (w and h "
+            "in transforms.json, the cameras of a COLMAP model), or give images that are neither turned nor cropped"
+        )
 
 
 def image_notes(prepared: Mapping[int, PreparedImage], downscale: float) -> dict[str, Any]:
@@ -189,17 +218,25 @@ def image_notes(prepared: Mapping[int, PreparedImage], downscale: float) -> dict
         "downscale": downscale,
         "grid": ", ".join(grids),
     }
-    if rescaled := sum(f["rescaled"] for f in found):
-        notes["intrinsics_rescaled"] = (
-            f"{rescaled} images differ in size from their camera; intrinsics follow the image"
+    if rescaled := Counter((f["size"], f["camera"]) for f in found if f["size"] != f["camera"]):
+        pairs = ", ".join(
+            f"{counted(n, 'image')} of {size} with a camera of {of}" for (size, of), n in rescaled.most_common(3)
         )
+        notes["intrinsics_rescaled"] = f"{pairs}: intrinsics follow the image"
+        if any(f["squeezed"] for f in found):
+            notes["intrinsics_rescaled"] += (
+                ", by another factor across than down; if images were cropped, give cameras of those"
+            )
+            log.warning("%s", notes["intrinsics_rescaled"])
+        else:
+            log.info("%s", notes["intrinsics_rescaled"])
     if distorted := sum(f["distorted"] for f in found):
-        notes["distortion"] = f"{distorted} images undistorted onto a pinhole of the same focal length"
+        notes["distortion"] = f"{counted(distorted, 'image')} undistorted onto a pinhole of the same focal length"
     if nan := sum(f["nan"] for f in found):
-        notes["nan_pixels"] = f"{nan} pixels are NaN, infinite or below absolute zero and masked"
-        log.warning("%d pixels are NaN, infinite or below absolute zero and masked", nan)
+        notes["nan_pixels"] = f"{counted(nan, 'pixel')} masked: NaN, infinite or below absolute zero"
+        log.warning("%s", notes["nan_pixels"])
     if rgb := sum(f["rgb_resized"] for f in found):
-        notes["rgb_resized"] = f"{rgb} visible images resized to the thermal grid"
+        notes["rgb_resized"] = f"{counted(rgb, 'visible image')} resized to the thermal grid"
     if masked := [p.mask for p in prepared.values() if p.mask is not None]:
         share = sum(int((~m).sum()) for m in masked) / sum(p.lens.width * p.lens.height for p in prepared.values())
         notes["masked_fraction"] = share

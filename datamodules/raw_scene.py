@@ -115,12 +115,14 @@ class SceneOptions:
         downscale: factor >= 1; images become round(W / d) x round(H / d) by area averages.
         thermal_channels: 1, or 3 to keep pseudo-colour (which has no temperature: the range is dropped).
         alpha_mask: True to leave out pixels whose alpha is below one half; otherwise alpha is ignored.
+        multiple: of which sides of images are that shrink, as close to W / d and H / d as that allows; 1 for any.
     """
 
     split: SplitRule
     downscale: float = 1.0
     thermal_channels: int = 1
     alpha_mask: bool = False
+    multiple: int = 1
 
     def __post_init__(self) -> None:
         if not self.downscale >= 1:

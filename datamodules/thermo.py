@@ -106,16 +106,9 @@ class Thermo(OutdoorDataModule):
     ) -> tuple[list[RawFrame], dict[str, np.ndarray | None], dict[str, Any]]:
         """Frames, points with their colours, and notes, from the JSON files or the sparse model."""
         if _has_transforms(folder):
-            frames, missing = listed_frames(self, folder, partial(self._described, meta))
+            frames, notes = listed_frames(self, folder, partial(self._described, meta))
             points, origin = mesh_points(folder, frames, self.random_points, self.seed)
-            notes: dict[str, Any] = {
-                "registered": len(frames) + len(missing),
-                "cameras": "transforms_train.json and transforms_test.json, OpenCV axes",
-                **origin,
-            }
-            if missing:
-                notes["images_missing"] = f"{len(missing)} frames have no image, dropped: {', '.join(missing[:5])}"
-            return frames, {"points": points}, notes
+            return frames, {"points": points}, notes | origin
         model = read_model(folder)
         index = image_index(folder, "images", "the folder of thermal images")
         files = {name: index.find(name) for name in model.names}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from heatsplat.contracts import SceneData, SceneError, evenly_spread
+from heatsplat.contracts import SceneData, SceneError, counted, evenly_spread
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
 from heatsplat.datamodules.formats.radiometric import read_bytes
@@ -23,7 +23,7 @@ from heatsplat.preparation.devices import Device, devices_of
 from heatsplat.preparation.frame import ThermalFrame
 from heatsplat.preparation.frames import Reading, read_recording, reading_of
 from heatsplat.preparation.makers import taken_at
-from heatsplat.preparation.report import Section, counted
+from heatsplat.preparation.report import Section
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from rich import get_console
 from rich.progress import Progress, track
 from scipy.spatial import cKDTree
 
-from heatsplat.contracts import SceneError, check_numbers, check_option, evenly_spread
+from heatsplat.contracts import SceneError, check_numbers, check_option, counted, evenly_spread
 from heatsplat.datamodules.formats.colmap import pose_matrix
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
@@ -29,7 +29,7 @@ from heatsplat.preparation.devices import Device, devices_of, listed
 from heatsplat.preparation.features import Features
 from heatsplat.preparation.fingerprint import fingerprint
 from heatsplat.preparation.frame import ThermalFrame
-from heatsplat.preparation.report import Section, counted
+from heatsplat.preparation.report import Section
 from heatsplat.preparation.rig import settle_rig, thermal_only
 from heatsplat.preparation.stretch import Stretch
 from heatsplat.preparation.target import WORK

@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.progress import track
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, counted
 from heatsplat.io.command_lines import setting, typed
 from heatsplat.preparation import report
 from heatsplat.preparation.conditions import GivenConditions, InputUncertainty
@@ -101,7 +101,7 @@ def prepare(
     writer.finish(frames, records)
     writer.write_masks(frames)
     there = len(frames) - fresh
-    log.info("%s%s", report.counted(len(frames), "frame"), f", {there} of them were there already" if there else "")
+    log.info("%s%s", counted(len(frames), "frame"), f", {there} of them were there already" if there else "")
     frames = [replace(f, rgb=writer.photo_of(f)) if writer.photo_of(f).exists() else f for f in frames]
     notes = [*found.notes, *([f"{dead} pixels of the detector are dead; masks/ leaves them out"] if dead else [])]
     parts = [

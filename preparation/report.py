@@ -14,7 +14,7 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from heatsplat.contracts import evenly_spread
+from heatsplat.contracts import counted, evenly_spread
 from heatsplat.datamodules.timestamps import instant
 from heatsplat.io.files import write_atomically
 from heatsplat.io.page import PAGE_FILE, plain, write_page
@@ -80,11 +80,6 @@ def write_report(target: Path, sections: Sequence[Section], made: str = PREPARED
     write_atomically(target / REPORT, text)
     write_page(target / PAGE_FILE, text)
     return target / REPORT
-
-
-def counted(number: int, what: str) -> str:
-    """ten frames, one frame."""
-    return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def recording(

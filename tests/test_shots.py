@@ -2,6 +2,7 @@
 
 import csv
 import logging
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -105,11 +106,24 @@ def test_a_figure_names_the_view_its_moment_and_the_clock(tmp_path):
     frames = shot_frames(scene, "view", 3600.0, 0, 1)
     camera = frames[0].camera
     images = [({"recorded": torch.full((camera.height, camera.width, 1), 0.5)}, None)]
-    write_shot(images, frames, scene, ShotFiles(tmp_path, video=False, figures="svg"), range_c=[-5.0, 5.0])
+    files, titles = ShotFiles(tmp_path, video=False, figures="svg"), {"recorded": "render"}
+    write_shot(images, frames, scene, files, range_c=[-5.0, 5.0], titles=titles)
     (figure,) = tmp_path.glob("figures/*.svg")
     svg = figure.read_text()
     assert "0_0000   60.0 min (2024-08-06 18:34 UTC)" in svg
-    assert "recorded · 100 % above 5 °C" in svg
+    assert "render · 100 % above 5 °C" in svg
+
+
+def test_limits_stand_before_the_title_which_narrow_panels_cut(tmp_path, monkeypatch):
+    scene = make_scene()
+    frames = shot_frames(scene, "view", scene.train.times_s[-1] + 3600.0, 0, 1)
+    size = frames[0].camera.height, frames[0].camera.width
+    seen = torch.arange(size[0] * size[1]).reshape(size) % 4 > 0
+    shown = []
+    monkeypatch.setattr(ShotFiles, "add_picture", lambda self, suffix, stem, panel, *_, **__: shown.append(panel.title))
+    images = [({"recorded": torch.full((*size, 1), 0.5)}, seen)]
+    write_shot(images, frames, scene, ShotFiles(tmp_path, video=False), titles={"recorded": "render"})
+    assert re.fullmatch(r"prediction, .* beyond the record · 75 % seen · render", shown[0])
 
 
 def test_moments_beyond_the_record_are_told_apart():

@@ -26,9 +26,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from heatsplat.composition import CONF, build, options_of, plain, run_of
-from heatsplat.errors import SceneError, check_count, check_numbers, check_option
+from heatsplat.errors import SceneError, check_count, check_numbers, check_option, counted
 from heatsplat.explanations import expected, explain, sentence
-from heatsplat.io.files import write_atomically
+from heatsplat.io.files import size_told, write_atomically
 from heatsplat.io.results import FAILED, METRICS_FILE
 from heatsplat.runs.lock import OccupiedError, locked
 from heatsplat.runs.signals import stoppable
@@ -331,8 +331,8 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
         uncertainty = Uncertainty(trained.module)
         uncertain = {"deviation": uncertainty.deviation, "widest": uncertainty.widest}
     files = ShotFiles(output_dir, **kinds)
-    written = write_shot(images, frames, trained.scene, files, config["range_c"], **uncertain)
-    log.info("%d frames, %d files in %s", len(frames), len(written), output_dir)
+    written = write_shot(images, frames, trained.scene, files, config["range_c"], trained.image_titles, **uncertain)
+    log.info("%s, %s in %s", counted(len(frames), "frame"), counted(len(written), "file"), output_dir)
 
 
 @_command
@@ -355,7 +355,7 @@ def simplify(config: dict[str, Any], output_dir: Path) -> None:
         moments_in(trained.scene, span_of(trained.scene), config["time"])  # refused before a long search
         write_ply = functools.partial(write_file, trained.module, Ply(), time_s=config["time"])
     written = write_levels(trained, merging, config["levels_c"], output_dir, write_ply)
-    log.info("%d files in %s", len(written), output_dir)
+    log.info("%s in %s", counted(len(written), "file"), output_dir)
 
 
 @_command
@@ -367,7 +367,7 @@ def view(config: dict[str, Any], output_dir: Path) -> None:
     check_count("training_cameras", config["training_cameras"])
     trained = _load(config, output_dir)
     path = write_viewer(trained.module, output_dir / FILE, config["training_cameras"])
-    log.info("%s (%.1f MB): open it in a browser", path, path.stat().st_size / 1e6)
+    log.info("%s (%s): open it in a browser", path, size_told(path.stat().st_size))
 
 
 @_command
@@ -390,7 +390,7 @@ def export(config: dict[str, Any], output_dir: Path) -> None:
     form = build(config["what"])
     trained = _load(config, output_dir)
     for path in write_files(trained.module, form, output_dir, config["time"], config["layer"]):
-        log.info("%s (%.1f MB)", path, path.stat().st_size / 1e6)
+        log.info("%s (%s)", path, size_told(path.stat().st_size))
 
 
 @_command

@@ -42,6 +42,11 @@ def check_count(name: str, value: Any, least: int = 1) -> None:
         raise SceneError(f"{name} must be a whole number, {least} or more, got {value}")
 
 
+def counted(number: int, what: str) -> str:
+    """A number with its noun for messages: "1 frame", "10 frames"."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 def is_number(value: Any) -> bool:
     """Whether a setting is a finite number: neither text nor true or false."""
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)

@@ -253,6 +253,7 @@ def write_shot(
     scene: SceneData,
     files: ShotFiles,
     range_c: Sequence[float] | None = None,
+    titles: Mapping[str, str] | None = None,
     deviation: Callable[[Frame], Tensor] | None = None,
     widest: float = 1.0,
 ) -> list[Path]:
@@ -275,6 +276,7 @@ def write_shot(
         scene: that is shown.
         files: which of them are wanted, and where.
         range_c: °C at the ends of the colours; None takes the scene's range.
+        titles: of images in pictures, by name; others have their name.
         deviation: standard deviation [H, W] of each pixel of a frame in the unit of the TIFFs, which lies in tiff_uncertainty
             and png_uncertainty, also of what was not seen; None writes none.
         widest: of these, at the end of the colours.
@@ -299,7 +301,7 @@ def write_shot(
             for number, (name, image) in enumerate(shown.items()):
                 suffix = f"_{name}" if number else ""
                 values = image if seen is None else image.where(seen[..., None], torch.nan)
-                panels.append(image_panel(values, name, bar, bounds))
+                panels.append(image_panel(values, (titles or {}).get(name, name), bar, bounds))
                 if image.shape[-1] == 1:
                     files.add_values(suffix, stem, (bounds.to_celsius(values) if bounds else values)[..., 0])
                 files.add_picture(suffix, stem, _with(panels[-1], limits), title)
@@ -320,8 +322,8 @@ def write_shot(
 
 
 def _with(panel: Panel, limits: Sequence[str]) -> Panel:
-    """A panel whose title says after its own words what limits what it shows."""
-    return replace(panel, title=" · ".join([panel.title, *limits]))
+    """A panel whose title says what limits what it shows, before its own words: narrow panels cut the end of titles."""
+    return replace(panel, title=" · ".join([*limits, panel.title]))
 
 
 def _write_table(path: Path, rows: Sequence[tuple[str, float | None, float, float]]) -> None:

@@ -9,7 +9,7 @@ import torch
 from fake_run import RANGE, WIDTH, wall, warmth
 
 from heatsplat.callbacks import surfaces
-from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE, ExtremeSurfaces
+from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE, ExtremeSurfaces, best_two
 from heatsplat.export.place import Place
 from heatsplat.geometry.alignment import Similarity
 from heatsplat.geometry.looks import Look, surface_points
@@ -74,3 +74,15 @@ def test_names_at_the_right_edge_stand_left_of_their_mark():
         return np.argwhere((picture != blank).any(-1))[:, 1]
 
     assert drawn(right).min() < 630 - surfaces.NAME and drawn(left).max() > 300 + surfaces.MARK + 10
+
+
+def test_the_first_surfaces_are_shown_before_many_others():
+    many, hottest, coldest = {"H2", "H3", "H4", "C2", "C3", "C4"}, {"H1"}, {"C1", "H2"}
+    assert sorted(best_two([many, hottest, coldest])) == [1, 2]
+    assert best_two([many, hottest, coldest, {"H1", "C1", "C4"}]) == (0, 3)
+
+
+def test_of_views_of_the_same_surfaces_the_fullest_comes_first():
+    assert best_two([{"H1"}, {"H1", "C1", "H2"}, {"C1"}]) == (1, 1)
+    assert best_two([{"C3"}, set(), {"H2", "C3"}])[0] == 2  # no view shows H1 and C1
+    assert best_two([set()]) == (0, 0)

@@ -32,3 +32,14 @@ def test_pictures_are_found_whatever_they_are_called(tmp_path, name):
     Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / name)
     text = page(f"# run\n\n{_picture(tmp_path / name, tmp_path)}\n", tmp_path)
     assert text.count("<img") == 1 and f'alt="{html.escape(name[:-4])}"' in text and 'width="8"' in text
+
+
+def test_a_clock_has_its_date_beside_its_seconds(tmp_path):
+    data = {
+        "clock_at_zero_s": 1722965689.25,
+        "weather": {"utc_at_zero_s": 1722965689.0, "wind": "calm"},
+        "duration_s": 1800.0,
+    }
+    text = markdown(RunResults(run={"method": "etgs", "scene": "a"}, data=data), tmp_path, [], None)
+    assert "- clock_at_zero_s: 1722965689.25 (2024-08-06 17:34:49)\n" in text
+    assert "utc_at_zero_s 1722965689 (2024-08-06 17:34:49 UTC), wind calm" in text and "- duration_s: 1800\n" in text

@@ -73,8 +73,8 @@ def test_duplicate_times_are_kept_and_noted(caplog):
     with caplog.at_level(logging.WARNING):
         scene = scene_of([grey(i) for i in range(9)], times=[0, 0, 0, 1, 2, 3, 4, 5, 6])
     assert len(scene.train) + len(scene.test) == 9
-    assert scene.notes["duplicate_times"].startswith("2 frames share")
-    assert "2 frames share" in caplog.text
+    assert scene.notes["duplicate_times"].startswith("2 frames with the time")
+    assert "2 frames with the time" in caplog.text
 
 
 def test_a_time_that_is_not_finite_names_its_frame():
@@ -163,8 +163,8 @@ def test_float_images_are_celsius_and_gaps_are_masked(caplog):
     expected = np.delete(images[2].ravel(), 4 * WIDTH + 5)
     got = scene.thermal_range.to_celsius(view.thermal[..., 0][view.mask])
     np.testing.assert_allclose(got, expected, atol=1e-5)
-    assert scene.notes["nan_pixels"].startswith("1 pixels")
-    assert "1 pixels are NaN" in caplog.text
+    assert scene.notes["nan_pixels"].startswith("1 pixel masked")
+    assert "1 pixel masked: NaN" in caplog.text
 
 
 def test_a_gap_does_not_spread_when_images_shrink():

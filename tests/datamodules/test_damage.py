@@ -203,7 +203,7 @@ def test_points_that_float32_cannot_hold_are_dropped(tmp_path):
     file.write_text(file.read_text().replace("0.0118", "1e308", 1).replace("1e30821624700256717", "1e308"))
     scene = colmap(tmp_path)
     assert len(scene.points) == 29 and scene.points.isfinite().all()
-    assert scene.notes["points_dropped"].startswith("1 points")
+    assert scene.notes["points_dropped"].startswith("1 point ")
 
 
 # Images ---------------------------------------------------------------------------------------------------------------

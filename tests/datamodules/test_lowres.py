@@ -5,6 +5,7 @@ import torch
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, ViewSet
 from heatsplat.datamodules.lowres import Reduction, degraded
+from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.geometry.resampling import resampled
 
 HEIGHT, WIDTH = 48, 64
@@ -120,3 +121,9 @@ def test_errors_name_the_key_and_the_remedy(degrade, upsample, message):
 def test_a_size_that_nothing_divides_says_so():
     with pytest.raises(SceneError, match="61 x 48 pixels, which 4 does not divide; no factor up to 16 does"):
         degraded(make_scene(width=61), "lr4")
+
+
+def test_images_that_are_shrunk_first_can_be_divided():
+    scene = Synthetic(scene="static", size="tiny", frames=9, downscale=4, degrade="lr4").scene  # of 64 x 52 pixels
+    assert {(f.camera.width, f.camera.height) for f in scene.train.frames} == {(4, 3)}
+    assert {(f.camera.width, f.camera.height) for f in scene.test.frames} == {(16, 12)}

@@ -181,7 +181,7 @@ def test_lists_tell_files_of_one_name_apart_by_their_folders(tmp_path):
 def test_frames_in_no_list_are_dropped_and_told(tmp_path):
     scene = two_cameras(tmp_path / "a", lambda files: {"train_filenames": files[1:4], "test_filenames": files[:1]})
     assert [f.name for f in scene.test.frames] == ["thermal/cam0/0.png"] and len(scene.train) == 3
-    assert scene.notes["images_unlisted"].startswith("4 frames are in no list, dropped: thermal/cam1/0.png")
+    assert scene.notes["images_unlisted"].startswith("4 frames in no list, dropped: thermal/cam1/0.png")
     with pytest.raises(
         SceneError, match="its lists name none of its frames: other.png is not among thermal/cam0/0.png"
     ):

@@ -175,10 +175,11 @@ def test_ntr_without_mesh_or_times(tmp_path):
     assert "time" not in scene.metadata
 
 
-def test_ntr_missing_and_damaged_files(tmp_path):
+def test_ntr_missing_and_damaged_files(tmp_path, caplog):
     write_ntr(tmp_path)
     (tmp_path / "train" / "1.png").unlink()
-    assert loaded(NTR, tmp_path).notes["images_missing"] == "1 frames have no image, dropped: train/1"
+    assert loaded(NTR, tmp_path).notes["images_missing"] == "1 of 10 frames without an image, dropped: train/1"
+    assert f"{tmp_path}: 1 of 10 frames without an image, dropped: train/1; put" in caplog.text
     (tmp_path / "mesh.obj").write_text("v 1 2\n")
     with pytest.raises(SceneError, match="mesh.obj, line 1: 'v 1 2' is no vertex"):
         loaded(NTR, tmp_path)

@@ -15,7 +15,7 @@ def loaded(root):
     return module.scene
 
 
-def test_images_and_models_that_differ_are_matched_and_noted(tmp_path):
+def test_images_and_models_that_differ_are_matched_and_noted(tmp_path, caplog):
     files = names(12)
     write_colmap(tmp_path, files)
     (tmp_path / "images" / files[3]).unlink()
@@ -23,8 +23,13 @@ def test_images_and_models_that_differ_are_matched_and_noted(tmp_path):
     scene = loaded(tmp_path)
     assert len(scene.train) + len(scene.test) == 11
     assert scene.notes["registered"] == 12
-    assert scene.notes["images_missing"].startswith("1 registered images have no file in images/, dropped: frame_003")
-    assert scene.notes["images_unregistered"].startswith("1 files are not in the model, unused: extra.png")
+    assert scene.notes["images_missing"].startswith("1 of 12 frames without a file in images/, dropped: frame_003")
+    warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert warned == [
+        f"{tmp_path / 'images'}: 1 of 12 frames without a file in images/, dropped: frame_003.png; put these images there, or "
+        "take the frames out of the list of cameras"
+    ]
+    assert scene.notes["images_unregistered"].startswith("1 file not in the model, unused: extra.png")
 
 
 def test_a_model_without_any_of_the_images_shows_both_names(tmp_path):

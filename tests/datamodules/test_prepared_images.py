@@ -1,9 +1,12 @@
+import logging
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.lens import Lens
-from heatsplat.datamodules.prepared_images import prepare
+from heatsplat.datamodules.prepared_images import check_equals, image_notes, prepare
 from heatsplat.datamodules.raw_scene import RawFrame, SceneOptions
 from heatsplat.datamodules.splits import SplitRule
 
@@ -35,3 +38,44 @@ def test_a_smaller_image_brings_its_lens():
     found = prepared(np.zeros((6, 8), np.uint8), downscale=2.0)
     assert found.thermal.shape == (3, 4) and (found.lens.width, found.lens.height) == (4, 3)
     assert found.mask is None
+
+
+def shaped(width, height, lens=LENS):
+    frame = RawFrame("a.png", np.eye(4), lens, lambda: np.zeros((height, width), np.uint8))
+    return prepare(frame, SceneOptions(SplitRule("every_8th")))
+
+
+@pytest.mark.parametrize(("downscale", "size"), [(1.0, (52, 66)), (4.0, (12, 16)), (1.1, (48, 60)), (50.0, (4, 4))])
+def test_images_that_shrink_can_be_divided(downscale, size):
+    lens = Lens(fx=60.0, fy=60.0, cx=33.0, cy=26.0, width=66, height=52)
+    frame = RawFrame("a.png", np.eye(4), lens, lambda: np.zeros((52, 66), np.uint8))
+    found = prepare(frame, SceneOptions(SplitRule("every_8th"), downscale, multiple=4))
+    assert found.thermal.shape == size and (found.lens.height, found.lens.width) == size
+    assert found.lens.fx == pytest.approx(60.0 * size[1] / 66) and found.lens.cy == pytest.approx(size[0] / 2)
+
+
+@pytest.mark.parametrize(("width", "height"), [(512, 640), (320, 240), (640, 480)])
+def test_an_image_of_another_shape_than_its_camera_is_refused(width, height):
+    lens = Lens(fx=600.0, fy=600.0, cx=320.0, cy=256.0, width=640, height=512)
+    with pytest.raises(
+        SceneError, match=f"image a is {width}x{height}, but its camera is 640x512.*1 of 2 images .*w and h"
+    ):
+        check_equals({"a": shaped(width, height, lens), "b": shaped(640, 512, replace(lens, fx=500.0))})
+
+
+def test_images_smaller_than_their_camera_are_told_in_the_log(caplog):
+    lens = Lens(fx=600.0, fy=600.0, cx=320.0, cy=256.0, width=641, height=513)
+    images = {"a": shaped(320, 256, lens), "b": shaped(320, 256, lens), "c": shaped(641, 513, replace(lens, fx=500.0))}
+    check_equals(images)
+    with caplog.at_level(logging.INFO):
+        notes = image_notes(dict(enumerate(images.values())), 1.0)
+    told = "2 images of 320x256 with a camera of 641x513: intrinsics follow the image"
+    assert notes["intrinsics_rescaled"] == told and (told, "INFO") in [(r.message, r.levelname) for r in caplog.records]
+
+
+def test_images_trimmed_by_a_few_pixels_are_warned_of(caplog):
+    lens = Lens(fx=600.0, fy=600.0, cx=320.0, cy=256.0, width=640, height=512)
+    image = shaped(640, 503, lens)
+    check_equals({"a": image})
+    notes = image_notes({0: image}, 1.0)
+    assert "1 image of 640x503 with a camera of 640x512" in caplog.text and "cropped" in notes["intrinsics_rescaled"]

@@ -73,7 +73,7 @@ def test_times_belong_to_names_not_to_ranks(tmp_path):
     scene = loaded(tmp_path, scene="s")
     by_name = {f.name: f.time_s for f in scene.train.frames}
     assert by_name[files[15]] == pytest.approx(10.25 * 15)
-    assert scene.notes["images_unregistered"].startswith("1 files")
+    assert scene.notes["images_unregistered"].startswith("1 file ")
 
 
 @pytest.mark.parametrize("form", ["color_{}", "color_{}_x", "pre_{}", "{}"])

@@ -179,12 +179,15 @@ def test_visible_images_never_stand_in_for_thermal_ones(tmp_path):
         loaded(tmp_path)
 
 
-def test_a_missing_image_is_dropped_and_noted(tmp_path):
+def test_a_missing_image_is_dropped_and_told(tmp_path, caplog):
     write_thermoscenes(tmp_path, STEMS)
     (tmp_path / "thermal" / f"{STEMS[0]}.PNG").unlink()
     scene = loaded(tmp_path)
     assert len(scene.train) == 5
-    assert scene.notes["images_missing"].startswith("1 frames have no thermal image, dropped: images/frame_train_00001")
+    assert scene.notes["images_missing"].startswith(
+        "1 of 8 frames without a thermal image, dropped: images/frame_train_00001"
+    )
+    assert f"{tmp_path}: 1 of 8 frames without a thermal image, dropped: images/frame_train_00001" in caplog.text
 
 
 def test_the_paired_layout_is_read_too(tmp_path):

@@ -6,6 +6,9 @@ import pytest
 from materials import checks, clean
 
 from heatsplat.contracts import Camera
+from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.doctor.base import material_of
+from heatsplat.doctor.checks import focal
 from heatsplat.doctor.checks.focal import find, fitting_factor
 
 
@@ -26,3 +29,12 @@ def test_a_wrong_focal_length_is_found_and_the_true_one_named(scene, factor):
     assert "focal" in checks(bad, only="focal")
     assert factor * fitting_factor(bad)[0] == pytest.approx(1.0, abs=0.04)
     assert not find(clean(scene))
+
+
+def test_a_focal_length_is_not_told_by_less_than_a_pixel(monkeypatch):
+    small, smaller = (material_of(Synthetic(scene="noisy_sensor", size="tiny", downscale=d).scene) for d in (2.5, 6.4))
+    assert not find(smaller) and abs(fitting_factor(smaller)[0] - 1.0) > 0.1  # 10 pixels across
+    monkeypatch.setattr(focal, "BETTER", 1.0)
+    assert not find(small) and 0.02 < abs(fitting_factor(small)[0] - 1.0) < 2 / 26
+    monkeypatch.setattr(focal, "EDGE", 0.0)
+    assert find(small) and not find(smaller)

@@ -46,3 +46,9 @@ def test_a_black_photo_or_a_closed_shutter_says_nothing_of_the_others():
         late = Material(**about, images=heat, photos=light[2:] + light[:2])
         found = said(late)
         assert "2 frame(s)" in found or "do not fit" in found
+
+
+def test_images_of_a_few_pixels_say_nothing_of_how_photos_lie():
+    images = torch.stack([torch.roll(clean().images[0], 3 * f, 1)[20:23, 20:24] for f in range(10)])
+    about = {"names": [f"{i}" for i in range(10)], "times_s": None, "chosen": list(range(10))}
+    assert findings_of(Material(**about, images=images, photos=[coarse(image) for image in images]), "pairing") == []

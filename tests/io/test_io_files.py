@@ -2,7 +2,7 @@
 
 import pytest
 
-from heatsplat.io.files import read_json_object, write_atomically
+from heatsplat.io.files import read_json_object, size_told, write_atomically
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
@@ -22,3 +22,13 @@ def test_what_is_no_object_is_read_as_none(tmp_path, content):
     assert read_json_object(path) is None
     path.write_text('{"made": 1}')
     assert read_json_object(path) == {"made": 1}
+
+
+def test_small_files_have_a_size_too():
+    assert [size_told(n) for n in (512, 43_210, 99_999, 150_000, 3_400_000)] == [
+        "0.5 kB",
+        "43 kB",
+        "100 kB",
+        "0.1 MB",
+        "3.4 MB",
+    ]

@@ -50,6 +50,16 @@ def test_a_notebook_composes_trains_loads_and_looks_at_temperatures(trained):
     assert torch.equal(scene.render(frame.camera, 0.0, "keep"), celsius)  # static splats know no time
 
 
+def test_pictures_of_rendered_images_are_not_called_recorded(trained, monkeypatch):
+    scene = heatsplat.load(trained[0] / "checkpoints" / "last.ckpt")
+    assert scene.image_names == ("recorded",) and scene.image_titles == {"recorded": "render"}
+    monkeypatch.setattr(scene.module, "sensor", torch.nn.Module())
+    scene.module.sensor.parts = {"blur": None}
+    assert scene.image_names == ("recorded", "clean")
+    flawed = {"recorded": "render, with the sensor's flaws", "clean": "render, without the sensor's flaws"}
+    assert scene.image_titles == flawed
+
+
 def test_visible_images_are_no_temperatures(tmp_path):
     colours = ("data.scene=glass", "thermal.modality=rgb", "thermal.channels=3", "test=false")
     config = heatsplat.compose([*QUICK, *colours])

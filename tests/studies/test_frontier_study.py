@@ -262,6 +262,13 @@ def test_where_no_run_can_be_read_the_folder_and_the_remedy_are_named(tmp_path):
         run(tmp_path / "out", str(tmp_path), **LEVELS)
 
 
+def test_one_run_is_one_run(tmp_path, no_pictures, caplog):
+    made(tmp_path / "a", "etgs", ["max_steps=9"], [(1, 20), (3, 28)], 5.0, 30.0)
+    with caplog.at_level("INFO"):
+        run(tmp_path / "out", str(tmp_path / "a"), **LEVELS)
+    assert "1 run of 1 recipe:" in caplog.text
+
+
 def test_levels_are_those_asked_for(runs, tmp_path, no_pictures):
     run(tmp_path / "out", str(runs), psnr_levels_db=[29, 21.5], mae_levels_c=[])
     text = (tmp_path / "out" / "frontier.md").read_text()

@@ -16,7 +16,7 @@ from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
 from heatsplat.callbacks.turntable import TURNTABLE_FILE
 from heatsplat.io.citations import citations
 from heatsplat.io.page import plain
-from heatsplat.io.quantities import moment
+from heatsplat.io.quantities import CLOCKS, Clock, moment
 from heatsplat.io.results import CURVE_FILE, RunResults
 from heatsplat.io.tables import NONE, markdown_table, read_csv
 from heatsplat.metrics.definitions import described
@@ -190,9 +190,20 @@ def _bullets(values: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, value in values.items():
         nested = isinstance(value, Mapping)
-        words = ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "on" if nested else _words(value)
+        words = (
+            ", ".join(f"{key} {_told(key, item)}" for key, item in value.items()) or "on"
+            if nested
+            else _told(name, value)
+        )
         lines.append(f"- {name}: {words}")
     return lines
+
+
+def _told(name: str, value: Any) -> str:
+    """A value of this name for people: ``_words``, and with the date beside what a clock shows."""
+    if name in CLOCKS and isinstance(value, int | float):
+        return f"{value:.15g} ({Clock(value, CLOCKS[name]).at(0.0, 'seconds')})"
+    return _words(value)
 
 
 def _words(value: Any) -> str:

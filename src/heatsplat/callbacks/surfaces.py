@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -126,19 +127,11 @@ def look(module: pl.LightningModule, frame: Frame) -> Look:
 def picture(
     looks: list[Look], hot: list[Surface], cold: list[Surface], scene: SceneData, time_s: float | None
 ) -> np.ndarray:
-    """The view that shows most of the surfaces, hot and cold ones where there is such a view, with their numbers; beside it the
-    one that shows most of the others."""
+    """The one or two views that show the foremost surfaces, with their numbers (``best_two``)."""
     marked = [(f"{kind}{i}", one.centre) for kind, found in (("H", hot), ("C", cold)) for i, one in enumerate(found, 1)]
     shown = [[(name, place) for name, point in marked if (place := _place(one, point)) is not None] for one in looks]
-
-    def both(i: int) -> tuple[int, int]:
-        """How many of the rarer kind a view shows, and how many in all."""
-        warm = sum(name.startswith("H") for name, _ in shown[i])
-        return min(warm, len(shown[i]) - warm), len(shown[i])
-
-    best = max(range(len(looks)), key=both)
+    best, second = best_two([{name for name, _ in one} for one in shown])
     missing = {name for name, _ in marked} - {name for name, _ in shown[best]}
-    second = max(range(len(looks)), key=lambda i: sum(name in missing for name, _ in shown[i]))
     found = {name for name, _ in shown[second]} & missing
     low, high = scene_bounds(scene, "thermal")
     title = "H hottest, C coldest" + ("" if time_s is None else f" after {moment(time_s)}")
@@ -150,6 +143,27 @@ def picture(
         panels.append(Panel(_marked(looks[second], shown[second], low, high), f"another view, with {others}"))
     panels[-1] = replace(panels[-1], bar=Bar(low, high, "°C"))
     return compose(panels)
+
+
+def best_two(shown: Sequence[set[str]]) -> tuple[int, int]:
+    """The two views, of those that show the surfaces with these names (H1, C1, H2, ...), that together show both first ones
+    where any view does, then as many as they can of the second, of the third, and so on.
+
+    Of equals those that show most, hot and cold ones in the first of them; both are the same where there is one view.
+    """
+    ranks = range(1, 1 + max((int(name[1:]) for names in shown for name in names), default=0))
+
+    def both(names: set[str]) -> tuple[int, int]:
+        """How many of the rarer kind, and how many in all."""
+        warm = sum(name.startswith("H") for name in names)
+        return min(warm, len(names) - warm), len(names)
+
+    def worth(pair: tuple[int, int]) -> tuple:
+        one, other = shown[pair[0]], shown[pair[1]]
+        seen = one | other
+        return [sum(f"{kind}{rank}" in seen for kind in "HC") for rank in ranks], both(one), both(other)
+
+    return max(product(range(len(shown)), repeat=2), key=worth)
 
 
 def _marked(one: Look, shown: Sequence[tuple[str, tuple[float, float]]], low: float, high: float) -> np.ndarray:

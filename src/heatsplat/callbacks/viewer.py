@@ -7,6 +7,7 @@ import logging
 import pytorch_lightning as pl
 
 from heatsplat.contracts import check_count
+from heatsplat.io.files import size_told
 from heatsplat.viewer.page import CAMERAS, FILE, write_viewer
 
 log = logging.getLogger("heatsplat")
@@ -33,4 +34,4 @@ class ViewerPage(pl.Callback):
             log.info("no %s: %s", FILE, module.thermal.stays_here)
             return
         path = write_viewer(module, module.output_dir / FILE, self.cameras)
-        log.info("%s (%.1f MB): open it in a browser", path, path.stat().st_size / 1e6)
+        log.info("%s (%s): open it in a browser", path, size_told(path.stat().st_size))

@@ -29,6 +29,13 @@ def write_atomically(path: str | Path, content: str | bytes | memoryview) -> Non
         temporary.unlink(missing_ok=True)
 
 
+def size_told(count: int) -> str:
+    """So many bytes for people: "3.4 MB", or "43 kB" where a tenth of a megabyte is too coarse."""
+    return (
+        f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.1f} kB" if count < 1e4 else f"{count / 1e3:.0f} kB"
+    )
+
+
 def read_json_object(path: Path) -> dict[str, Any] | None:
     """The object in a JSON file, or None where there is none that can be read."""
     try:

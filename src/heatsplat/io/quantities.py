@@ -23,6 +23,8 @@ POSSIBLE = {
     "convection_w_m2_k": (0.0, math.inf),
     "u_value_w_m2_k": (0.0, math.inf),
 }
+# Names of what the clocks of a record show at its second 0, and their zones; a camera's own is not known.
+CLOCKS = {"utc_at_zero_s": "UTC", "clock_at_zero_s": ""}
 SUFFIXES = {
     "_c_per_h": "°C/h",
     "_k_per_kw_m2": "K m²/kW",

@@ -209,6 +209,13 @@ class Trained:
         clean = ("clean",) if self.module.sensor.parts else ()
         return ("recorded", *clean, *self.module.thermal.companions)
 
+    @property
+    def image_titles(self) -> dict[str, str]:
+        """What those of ``image_names`` are in a picture: all are rendered, though "recorded" is what the camera would record."""
+        if not self.module.sensor.parts:
+            return {"recorded": "render"}
+        return {"recorded": "render, with the sensor's flaws", "clean": "render, without the sensor's flaws"}
+
     def images(self, frame: Frame, names: Sequence[str]) -> dict[str, Tensor]:
         """Images [H, W, C] in [0, 1] of a frame by name, on the CPU."""
         found = self.module.predict_all(frame)

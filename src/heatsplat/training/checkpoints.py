@@ -13,7 +13,7 @@ import torch
 from pytorch_lightning.plugins.io import CheckpointIO
 
 from heatsplat.contracts import SceneError
-from heatsplat.io.files import write_atomically
+from heatsplat.io.files import size_told, write_atomically
 from heatsplat.io.results import checkpoint_of
 
 
@@ -34,7 +34,7 @@ class CheckpointFiles(CheckpointIO):
             write_atomically(path, content.getbuffer())
         except OSError as error:
             raise SceneError(
-                f"the checkpoint of step {checkpoint['global_step']} ({content.tell() / 1e6:.1f} MB) could not be written to "
+                f"the checkpoint of step {checkpoint['global_step']} ({size_told(content.tell())}) could not be written to "
                 f"{path}: {error.strerror}. Earlier checkpoints are as they were; make room and start the same command again"
             ) from error
 

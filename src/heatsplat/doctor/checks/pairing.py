@@ -12,6 +12,7 @@ BETTER = 0.03  # correlation by which another frame has to fit better than a fra
 NEARLY_ALL = 0.7
 MATCH = 0.3  # correlation of the photo that fits best from which it is one of the same moment
 OFF = 0.025  # of the width: how far photos may lie beside thermal images
+LEAST_REACH = 3  # coarse pixels to either side in which photos are looked for
 # Seconds, and share of the usual step between frames, by which clocks may differ; EXIF often has whole seconds.
 CLOCK_S, WHOLE_S, CLOCK_STEP = 0.2, 1.0, 0.1
 
@@ -123,9 +124,11 @@ def _shift(heat: Tensor, light: Tensor) -> Tensor | None:
     a = torch.fft.rfft2(heat - heat.mean((1, 2), keepdim=True))
     b = torch.fft.rfft2(light - light.mean((1, 2), keepdim=True))
     height, width = heat.shape[1:]
+    if min(height, width) <= 2 * LEAST_REACH:
+        return None
     fits = torch.fft.irfft2(a.conj() * b, s=(height, width)).sum(0)
     fits = fits / (heat.std() * light.std() * heat.numel())
-    reach = max(3, width // 6)
+    reach = max(LEAST_REACH, width // 6)
     fits = torch.roll(fits, (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1]
     best = int(fits.argmax())
     if float(fits.max()) < 0.25 or float(fits.max()) < float(fits[reach, reach]) + 2 * BETTER:

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError, is_number
+from heatsplat.contracts import SceneError, counted, is_number
 from heatsplat.io.files import write_atomically
 from heatsplat.io.page import write_page
 from heatsplat.io.pictures import figure_picture, write_png
@@ -96,7 +96,7 @@ def run(
     with SummaryWriter(str(output_dir / "tb")) as writer:
         writer.add_image("frontier", pixels, dataformats="HWC")
         writer.add_text("frontier", text)
-    log.info("%d runs of %d recipes:\n%s", len(found), len(recipes), text)
+    log.info("%s of %s:\n%s", counted(len(found), "run"), counted(len(recipes), "recipe"), text)
     return recipes
 
 
