@@ -14,7 +14,7 @@ from heatsplat.datamodules.formats.dji import PER_KELVIN
 from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.physics.planck import Band
 from heatsplat.physics.radiometry import BandResponse, PlanckResponse
-from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, MEDIAN_C, is_centikelvin
+from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, USUAL_MEDIAN_C, is_centikelvin
 
 # °C per count of other cameras that store kelvin; nothing in a file tells them apart, so they are named and asked for.
 OTHERS = {
@@ -118,7 +118,7 @@ class Meaning:
         hints = [
             f" As {name} they would be {celsius:.1f} °C (counts.scale={scale:g})."
             for name, (scale, celsius) in would.items()
-            if MEDIAN_C[0] < celsius < MEDIAN_C[1]
+            if USUAL_MEDIAN_C[0] < celsius < USUAL_MEDIAN_C[1]
         ]
         raise SceneError(
             f"{path} holds 16-bit counts around {middle:.0f}, which are no kelvin x 100. Say what they mean: "

@@ -6,13 +6,10 @@ What brings torch is imported within a job, so that --help, --cfg and typing err
 from __future__ import annotations
 
 import functools
-import itertools
 import logging
 import os
-import re
 import signal
 import sys
-import textwrap
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
@@ -33,6 +30,7 @@ from heatsplat.io.results import FAILED, METRICS_FILE
 from heatsplat.runs.lock import OccupiedError, locked
 from heatsplat.runs.signals import stoppable
 from heatsplat.training.machine import loading, prepare_machine
+from heatsplat.usage import usage
 
 if TYPE_CHECKING:
     from heatsplat.runs.run import Trained
@@ -55,14 +53,6 @@ EXAMPLES = {
     "study": ("study=frontier study.runs=outputs",),
     "prepare": ("source=/data/flight target=/data/my_scene",),
 }
-# What --help says of a command beside its own file: the files of groups whose settings it explains, and the groups of which it
-# names the options, those that most begin with in a sentence each.
-EXPLAINED = {
-    "prepare": ("poses/thermal", "correct/scene"),
-    "simplify": ("merge/flat",),
-    "export": tuple(f"what/{option}" for option in options_of("what")),
-}
-TOLD = {"train": ("method", "data", "preset"), "study": ("study",)}
 
 
 def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
@@ -101,7 +91,7 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
         try:
             try:
                 if not {"--help", "-h"}.isdisjoint(sys.argv[1:]):
-                    print(_help(name, job.__doc__ or ""))
+                    print(usage(name, job.__doc__ or "", sys.argv[1:]))
                     return None
                 return main()
             finally:
@@ -119,56 +109,6 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
                 del os.environ[ALL_OF_IT]
 
     return command
-
-
-def _help(name: str, doc: str) -> str:
-    """The settings of a command as its files of configuration explain them, without what is internal."""
-    text = _file(name)
-    own, *_ = re.split(r"^(?:hydra:|\w+: +# internal)", text, maxsplit=1, flags=re.MULTILINE)
-    lines = [doc.partition("\n")[0], "", *_explained(own)]
-    for file in EXPLAINED.get(name, ()):
-        group, _, option = file.partition("/")
-        lines += ["", f"{group}:  # with {group}={option}", *(f"  {line}" for line in _explained(_file(file)))]
-    for group in TOLD.get(name, ()):
-        options = options_of(group)
-        wide = max(map(len, options))
-        lines += [
-            "",
-            f"{group}:",
-            *(f"  {option:{wide}}  {_sentence(f'{group}/{option}')}".rstrip() for option in options),
-        ]
-    told = {group for groups in TOLD.values() for group in groups}
-    groups = [
-        group for group in re.findall(r"^  - (\w+):", own, re.MULTILINE) if group not in told and options_of(group)
-    ]
-    if name in TOLD and groups:
-        lines += ["", "Choices of the other groups:"]
-        for group in groups:
-            lines += textwrap.wrap(f"  {group}: {', '.join(options_of(group))}", 130, subsequent_indent="    ")
-    lines += ["", "With --cfg job: all settings and their values, as what stands beside it sets them."]
-    return re.sub("\n{3,}", "\n\n", "\n".join(lines))
-
-
-def _file(name: str) -> str:
-    return (Path(CONF) / f"{name}.yaml").read_text(encoding="utf-8")
-
-
-def _explained(text: str) -> list[str]:
-    """The lines of a file of configuration that say something to a user: choices of groups stand as they are set."""
-    internal = ("defaults:", "_target_", "by:", "- _self_", "- override", "- optional")
-    lines = text.strip().splitlines()
-    shown = (
-        line.removeprefix("  - ") for line in lines if not line.strip().startswith(internal) and line != "  - thermal"
-    )
-    return [line for line in shown if ": ${" not in line or "#" in line]
-
-
-def _sentence(name: str) -> str:
-    """The first sentence of the comments at the head of a file of configuration, without its command."""
-    head = itertools.takewhile(lambda line: line.startswith("#"), _file(name).splitlines())
-    said = (line.removeprefix("# ") for line in head)
-    text = " ".join(line for line in said if not line.startswith(("@package", "python src/")))
-    return re.split(r"(?<=[\w)}])\. (?=[A-Z])|:? python src/", text)[0].rstrip(" .:")
 
 
 def _job(

@@ -43,6 +43,7 @@ ALLOWED = {
     "viewer": {"contracts", "export", "io"},
     "composition": {"io", "training", "heatsplat"},
     "explanations": {"composition", "errors", "io"},
+    "usage": {"composition"},
     "doctor": {"contracts", "effects", "io", "physics"},
     "runs": {
         "contracts",
@@ -85,6 +86,7 @@ ALLOWED = {
         "shots",
         "studies",
         "uncertainty",
+        "usage",
         "viewer",
     },
     "datamodules": {"contracts", "geometry", "physics", "sensors", "training"},

@@ -10,7 +10,7 @@ KELVIN_AT_0_C = 273.15
 DAY_S = 86400.0
 CENTIKELVIN = 0.01  # kelvin per count of cameras that store kelvin x 100 (Lepton's TLinear, Boson's radiometric video)
 # Counts whose median and whose bulk lie so are taken for kelvin x 100.
-MEDIAN_C, BULK_K = (-40.0, 100.0), 200.0
+USUAL_MEDIAN_C, USUAL_SPAN_K = (-40.0, 100.0), 200.0
 STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m² K⁴), CODATA 2018
 
 Temperature = TypeVar("Temperature", float, Tensor)
@@ -28,4 +28,7 @@ def celsius(kelvin: Temperature) -> Temperature:
 
 def is_centikelvin(low: float, median: float, high: float) -> bool:
     """Whether counts are plausible as kelvin x 100, by their 1, 50 and 99 % percentile."""
-    return MEDIAN_C[0] < CENTIKELVIN * median - KELVIN_AT_0_C < MEDIAN_C[1] and CENTIKELVIN * (high - low) < BULK_K
+    return (
+        USUAL_MEDIAN_C[0] < CENTIKELVIN * median - KELVIN_AT_0_C < USUAL_MEDIAN_C[1]
+        and CENTIKELVIN * (high - low) < USUAL_SPAN_K
+    )

@@ -37,7 +37,6 @@ from heatsplat.thermal.coordinates import ImageRange
 from heatsplat.thermal.surface_drivers import drivers_of
 
 SUN_LIMIT = 200.0  # K m²/kW: a black surface at 8 °C that loses heat by its own radiation alone
-HALF = 0.5  # of the light that falls on it is what a surface absorbs that no image tells more of
 SHARE_LIMITS = (0.02, 0.98)  # of radiation in the exchange: where attributes divide by it or by the rest
 WIND_LIMITS = (0.0, 0.95)  # of wind in convection: in a calm something is left
 START_SHARE, START_WIND = 0.4, 0.4  # e = 0.9 beside 8 W/(m² K), of which a light breeze makes 40 %
@@ -46,6 +45,7 @@ START_CORE_S = 6 * 3600.0  # time constant of a core, and its coupling beside th
 START_COUPLING = 0.5
 COUPLINGS = (math.log(0.02), math.log(50.0))
 START_SUN = (5.0, 80.0)  # K m²/kW, limits of what the images' mean temperature is taken to say
+START_ABSORPTIVITY = 0.5  # at most, where the exchange is given: of what images by night do not tell, it stays so
 LOG_RATES = (math.log(1e-7), math.log(0.1))  # 1/s: time constants from 10 seconds to 4 months
 GIVEN = (NORMALS, SUN_SEEN, SKY_SEEN)
 LEARNED = ("initial_state", "log_rate", "raw_sun", "raw_share", "raw_wind", "inner_rise")
@@ -456,7 +456,7 @@ class EnergyBalance(ThermalModel):
             loss = loss + share * (power_excess(excess, drivers.reference_k) - mean(drivers.sky))
         low, high = START_SUN
         if self._exchange_given:  # what heat from within does is not in this balance, and would count for the sun
-            high = min(high, HALF * self._sun_limit)
+            high = min(high, START_ABSORPTIVITY * self._sun_limit)
         return (loss / mean(light).clamp(min=1e-6)).clamp(low, high).to(grey)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest) -> None:

@@ -1,0 +1,84 @@
+"""What a command says of itself: its settings, as its files of configuration explain them, and what there is to choose."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import textwrap
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from pathlib import Path
+
+from heatsplat.composition import CONF
+
+# Groups of which the settings are explained for these options, "*" for all.
+EXPLAINED = {
+    "prepare": {"poses": "thermal", "correct": "scene"},
+    "simplify": {"merge": "flat"},
+    "export": {"what": "*"},
+}
+# Groups whose options are told in a sentence each; of a command's other groups their names.
+TOLD = {"train": ("method", "data", "preset"), "study": ("study",)}
+ELSEWHERE = {group for groups in TOLD.values() for group in groups}
+WIDTH = 130
+
+
+def usage(command: str, doc: str, arguments: Sequence[str] = ()) -> str:
+    """The text of --help.
+
+    Args:
+        command: such as "train", the name of its file in the folder of configurations.
+        doc: of its job, whose first line comes first.
+        arguments: of the command line, of which --config-dir is a further folder of configurations.
+    """
+    places = [Path(CONF), *_given(arguments)]
+    text = (places[0] / f"{command}.yaml").read_text(encoding="utf-8")
+    own, *_ = re.split(r"^(?:hydra:|\w+: +# internal)", text, maxsplit=1, flags=re.MULTILINE)
+    lines = [doc.partition("\n")[0], "", *_explained(own)]
+    for group, pattern in EXPLAINED.get(command, {}).items():
+        for option, file in _options(places, group, pattern).items():
+            inner = _explained(file.read_text(encoding="utf-8"))
+            lines += ["", f"{group}:  # with {group}={option}", *(f"  {line}" for line in inner)]
+    for group in TOLD.get(command, ()):
+        options = _options(places, group)
+        wide = max(map(len, options))
+        told = (f"  {option:{wide}}  {_sentence(file)}".rstrip() for option, file in options.items())
+        lines += ["", f"{group}:", *told]
+    groups = re.findall(r"^  - (\w+):", own, re.MULTILINE) if command in TOLD else []
+    choices = {group: _options(places, group) for group in groups if group not in ELSEWHERE}
+    if any(choices.values()):
+        lines += ["", "Choices of the other groups:"]
+    for group, options in choices.items():
+        if options:
+            lines += textwrap.wrap(f"  {group}: {', '.join(options)}", WIDTH, subsequent_indent="    ")
+    lines += ["", "With --cfg job: all settings and their values, as what stands beside it sets them."]
+    return re.sub("\n{3,}", "\n\n", "\n".join(lines))
+
+
+def _given(arguments: Sequence[str]) -> list[Path]:
+    """The folders that Hydra's --config-dir names."""
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config-dir", "-cd", type=Path)
+    folder = parser.parse_known_args([*arguments])[0].config_dir
+    return [] if folder is None else [folder.expanduser()]
+
+
+def _options(places: Sequence[Path], group: str, pattern: str = "*") -> dict[str, Path]:
+    """Files of the options of a group, by name."""
+    files = (file for place in places for file in (place / group).glob(f"{pattern}.yaml"))
+    return dict(sorted({file.stem: file for file in files}.items()))
+
+
+def _explained(text: str) -> list[str]:
+    """The lines of a file of configuration that say something to a user: choices of groups stand as they are set."""
+    internal = ("defaults:", "_target_", "by:", "- _self_", "- override", "- optional")
+    lines = (line for line in text.strip().splitlines() if not line.strip().startswith(internal))
+    return [line.removeprefix("  - ") for line in lines if ": ${" not in line or "#" in line]
+
+
+def _sentence(file: Path) -> str:
+    """The first sentence of the comments at the head of a file of configuration, without its command."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    said = (line.removeprefix("# ") for line in itertools.takewhile(lambda line: line.startswith("#"), lines))
+    text = " ".join(line for line in said if not line.startswith(("@package", "python src/")))
+    return re.split(r"(?<=[\w)}])\. (?=[A-Z])|:? python src/", text)[0].rstrip(" .:")
