@@ -299,13 +299,13 @@ CASES = {
         ("raw_wind", "mean_wind"),
     ),
     "shadows": Case(
-        ("relaxation", "solar"),
-        lambda: ByHand(air(sun=True)),
+        ("relaxation", "solar", "radiation", "convection"),
+        lambda: ByHand(air(sun=True, sky="auto", wind=True)),
         ("sun_seen",),
     ),
     "sky_view": Case(
-        ("relaxation", "solar", "shadows"),
-        lambda: ByHand(air(sun=True, shadows=True)),
+        ("relaxation", "solar", "radiation", "convection", "shadows"),
+        lambda: ByHand(air(sun=True, sky="auto", wind=True, shadows=True)),
         ("sky_seen",),
     ),
     "albedo": Case(("relaxation", "solar"), lambda: ByHand(air(sun=True)), ()),

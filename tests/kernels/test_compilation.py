@@ -2,6 +2,7 @@
 
 import ast
 import errno
+import gc
 import os
 import shutil
 import sys
@@ -391,3 +392,25 @@ def test_processes_may_fill_the_cache_at_once(folder, tmp_path):
         assert process.exitcode == 0
     assert was_loaded(doubled_anew())
     assert len(list(folder.iterdir())) == 1
+
+
+@pytest.mark.parametrize("collects", [True, False])
+def test_nobody_looks_for_garbage_while_the_compiler_works(monkeypatch, collects):
+    """Also where it fails; afterwards it is as it was."""
+    while_compiling, passes = [], compilation._passes
+    monkeypatch.setattr(compilation, "_passes", lambda state: noting(while_compiling, passes(state)))
+    before = gc.isenabled()
+    (gc.enable if collects else gc.disable)()
+    try:
+        kernel(double)(np.arange(5.0))
+        with pytest.raises(numba.TypingError):
+            kernel(double)("no numbers")
+        after = gc.isenabled()
+    finally:
+        (gc.enable if before else gc.disable)()
+    assert (while_compiling, after) == ([False, False], collects)
+
+
+def noting(notes: list[bool], passes: list) -> list:
+    notes.append(gc.isenabled())
+    return passes

@@ -8,6 +8,7 @@ import torch
 from heatsplat.renderers.base import rasterization
 
 WIDTH, HEIGHT, COUNT = 40, 32, 60
+CHANNELS = 4  # with no map or three, which runs have compiled as well
 
 
 def scene(dtype: torch.dtype):
@@ -17,7 +18,7 @@ def scene(dtype: torch.dtype):
     quats = torch.randn(COUNT, 4, generator=generator)
     scales = 0.02 + 0.15 * torch.rand(COUNT, 3, generator=generator)
     opacities = 0.1 + 0.85 * torch.rand(COUNT, generator=generator)
-    values = torch.rand(COUNT, 2, generator=generator)
+    values = torch.rand(COUNT, CHANNELS, generator=generator)
     K = torch.tensor([[35.0, 0.0, 20.0], [0.0, 35.0, 16.0], [0.0, 0.0, 1.0]])
     tensors = [tensor.to(dtype) for tensor in (means, quats, scales, opacities, values)]
     return tensors, torch.eye(4, dtype=dtype), K.to(dtype)
@@ -61,9 +62,9 @@ def test_weights_and_what_is_left_add_up_to_one():
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_maps_change_neither_image_nor_gradients(backend: str):
     dtype = torch.float64 if backend == "reference" else torch.float32
-    background = torch.tensor([0.3, 0.6], dtype=dtype)
+    background = torch.linspace(0.3, 0.6, CHANNELS, dtype=dtype)
     plain, leaves = drawn(backend, 0, background=background)
-    probed, others = drawn(backend, 2, background=background)
+    probed, others = drawn(backend, 3, background=background)
     assert plain.weighted is None
     assert torch.equal(plain.features, probed.features)
     plain.features.square().sum().backward()
