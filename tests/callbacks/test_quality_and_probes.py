@@ -169,6 +169,16 @@ def test_a_clean_image_is_compared_with_what_it_is_compared_with():
     ]
 
 
+def test_a_clean_image_has_scores_only_against_a_clean_one():
+    """Otherwise errors hold what the camera added, as the title says."""
+    scene = wall()
+    view, image = scene.test[0], scene.test[0].thermal
+    alone, known = (panels(one, "clean", image, scene)[1] for one in (view, replace(view, clean=image)))
+    assert "PSNR" not in alone and "MAE" not in alone and "which is in the difference" in alone
+    assert "PSNR" in known and "difference" not in known
+    assert "PSNR" in panels(view, "thermal", image, scene)[1]
+
+
 def test_images_of_a_real_camera_are_not_called_the_truth():
     scene = wall(truth=False)
     shown, _ = panels(scene.test[0], "thermal", scene.test[0].thermal, scene)

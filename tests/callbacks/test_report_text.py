@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from heatsplat.callbacks.report import show
-from heatsplat.callbacks.report_text import _picture, markdown
+from heatsplat.callbacks.report_text import _picture, effects_table, markdown
 from heatsplat.io.page import page
 from heatsplat.io.results import RunResults
 
@@ -43,3 +43,34 @@ def test_a_clock_has_its_date_beside_its_seconds(tmp_path):
     text = markdown(RunResults(run={"method": "etgs", "scene": "a"}, data=data), tmp_path, [], None)
     assert "- clock_at_zero_s: 1722965689.25 (2024-08-06 17:34:49)\n" in text
     assert "utc_at_zero_s 1722965689 (2024-08-06 17:34:49 UTC), wind calm" in text and "- duration_s: 1800\n" in text
+
+
+def effect(on: bool, told: bool, statistic: float | None, reason: str) -> dict:
+    return {"on": on, "told": told, "statistic": statistic, "threshold": 1.0, "gain_db": None, "reason": reason} | {
+        "parameters": 0,
+        "ms_per_step": 0.0,
+    }
+
+
+def test_what_is_simulated_comes_first_and_one_reason_is_said_once():
+    effects = {
+        "solar": effect(False, True, None, "the scene lacks weather"),
+        "agc": effect(False, True, 0.5, "no gains"),
+        "reflection": effect(False, True, None, "no surroundings"),
+        "relaxation": effect(False, False, None, "too few frames"),
+        "albedo": effect(False, True, None, "the scene lacks weather"),
+        "frame_offset": effect(True, False, 2.0, "offsets"),
+        "fixed_pattern": effect(True, True, 6.0, "places differ"),
+    }
+    *table, empty, below = effects_table(effects)
+    cells = [[cell.strip() for cell in line.strip("|").split("|")][:2] for line in table[2:]]
+    assert cells == [
+        ["fixed_pattern", "**yes**"],
+        ["frame_offset", "yes, but cannot be told"],
+        ["relaxation", "cannot be told"],
+        ["agc", "no"],
+        ["reflection", "no"],
+    ]
+    assert (empty, below) == ("", "- solar, albedo: no; the scene lacks weather")
+    alone = {name: effects[name] for name in ("solar", "albedo")}
+    assert effects_table(alone) == [below]

@@ -133,19 +133,28 @@ def panels(
     bounds: tuple[float, float] | None = None,
     error_limit: float | None = None,
 ) -> tuple[list[Panel], str]:
-    """Ground truth or what was recorded, render and error of one image of a view, and a title with its scores."""
+    """Ground truth or what was recorded, render and error of one image of a view, and a title with its scores.
+
+    The image of a real camera has its drift and blur, and nobody knows what it would have recorded without them: a render that
+    leaves them out has no scores against it.
+    """
     prediction, target = prediction.float().cpu(), view.image(modality).cpu()
     mask = None if view.mask is None else view.mask.cpu()
     thermal_range = scene.range_of(modality)
-    title = [view.frame.name] if modality == "thermal" else [view.frame.name, modality]
+    clean = modality == "clean"
+    true = view.clean is not None if clean else scene.truth is not None
+    title = [view.frame.name]
+    if clean and not true:
+        title.append("clean: without what the camera adds, which is in the difference")
+    elif modality != "thermal":
+        title.append(modality)
     if view.frame.time_s is not None:
         title.append(f"t = {moment(view.frame.time_s, clock_of(scene))}")
-    scores = [(psnr(prediction, target, mask), "PSNR {:.2f} dB")]
-    if thermal_range is not None and target.shape[-1] == 1:
-        scores.append((mae_c(prediction, target, thermal_range, mask), "MAE {:.3g} °C"))
-    title += [text.format(value) for value, text in scores if value is not None]
-    # The image of a real camera has its drift and blur, and nobody knows what it would have recorded without them.
-    true = scene.truth is not None if modality != "clean" else view.clean is not None
+    if true or not clean:
+        scores = [(psnr(prediction, target, mask), "PSNR {:.2f} dB")]
+        if thermal_range is not None and target.shape[-1] == 1:
+            scores.append((mae_c(prediction, target, thermal_range, mask), "MAE {:.3g} °C"))
+        title += [text.format(value) for value, text in scores if value is not None]
     against = "ground truth" if true else "recorded"
     return comparison_panels(target, prediction, thermal_range, mask, bounds, error_limit, against), "   ·   ".join(
         title

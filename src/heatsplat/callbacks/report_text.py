@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -22,6 +22,8 @@ from heatsplat.io.tables import NONE, markdown_table, read_csv
 from heatsplat.metrics.definitions import described
 from heatsplat.viewer.page import FILE as VIEWER_FILE
 
+DEFINITIONS_TITLE = "Definitions of the scores"
+
 
 def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves: Path | None) -> str:
     """The whole report: scores beside cost, the course, pictures by relative path, what was found and learned, data, versions.
@@ -33,7 +35,7 @@ def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves
     lines = [f"# {run.get('method') or run.get('thermal_model')} on {plain(str(run.get('scene')))}", ""]
     pairs = zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("", ""))
     table = markdown_table(("score", "value", "", "cost", "value"), [(*score, "", *cost) for score, cost in pairs])
-    lines += ["## Scores and cost", "", *table]
+    lines += ["## Scores and cost", "", *table, "", f"What each score is stands below, under {DEFINITIONS_TITLE}."]
     missing: dict[str, list[str]] = {}
     for name in (f"{part}.{score}" for part in ("test", "cost") for score in content[part]):
         if name in reasons:
@@ -59,7 +61,7 @@ def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves
     lines += ["", "## The run", "", *_bullets(run)]
     lines += _effects_section(content["effects"])
     lines += ["", "## Data: findings and assumptions", "", *_bullets(content["data"])]
-    lines += ["", "## Definitions of the scores", "", *_bullets(content["definitions"])]
+    lines += ["", f"## {DEFINITIONS_TITLE}", "", *_bullets(content["definitions"])]
     lines += ["", "## Versions", "", *_bullets(content["versions"])]
     if entries := citations(run.get("method")):
         lines += ["", "## How to cite", "", *(f"- {entry}" for entry in entries)]
@@ -153,20 +155,39 @@ def _effects_section(effects: Mapping[str, Any]) -> list[str]:
 
 
 def effects_table(effects: Mapping[str, Any]) -> list[str]:
-    """Lines of a Markdown table of ``describe_effects``: what is simulated, why, and what it costs."""
-    rows = []
+    """Lines of a Markdown table of ``describe_effects``: what is simulated, why, and what it costs.
+
+    First comes what is simulated, then what cannot be told, then what the scene does not show. Effects that were left out for one
+    reason and without a number stand below the table, in a line for each reason.
+    """
+    unasked: dict[str, list[str]] = {}
     for name, effect in effects.items():
-        statistic, threshold, parameters, milliseconds = (
-            NONE if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else f"{effect[key]:.3g}"
-            for key in ("statistic", "threshold", "parameters", "ms_per_step")
-        )
-        sure = "**yes**" if effect["on"] else "no"
-        on = sure if effect["told"] else "yes, but cannot be told" if effect["on"] else "cannot be told"
-        gain, cost = effect["gain_db"], effect["ms_per_step"]
-        gains = (NONE if gain is None else f"{gain:.1f}", f"{gain / cost:.2g}" if gain and cost and cost > 0 else NONE)
-        rows.append((name, on, statistic, threshold, *gains, effect["reason"], parameters, milliseconds))
+        if not effect["on"] and effect["told"] and effect["statistic"] is None:
+            unasked.setdefault(effect["reason"], []).append(name)
+    together = {reason: names for reason, names in unasked.items() if len(names) > 1}
+    asked = {name: effect for name, effect in effects.items() if name not in chain(*together.values())}
+    rows = [_effects_row(name, asked[name]) for name in sorted(asked, key=lambda name: _place(asked[name]))]
     head = ("effect", "simulated", "statistic", "threshold", "dB", "dB per ms", "reason", "parameters", "ms per step")
-    return markdown_table(head, rows, align="llrrrrlrr")
+    table = markdown_table(head, rows, align="llrrrrlrr") if rows else []
+    below = [f"- {', '.join(names)}: no; {reason}" for reason, names in together.items()]
+    return [*table, *([""] if rows and below else []), *below]
+
+
+def _place(effect: Mapping[str, Any]) -> tuple[bool, bool]:
+    """In the table of effects: effects of the same place keep their order."""
+    return not effect["on"], effect["told"] != effect["on"]
+
+
+def _effects_row(name: str, effect: Mapping[str, Any]) -> tuple[str, ...]:
+    statistic, threshold, parameters, milliseconds = (
+        NONE if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else f"{effect[key]:.3g}"
+        for key in ("statistic", "threshold", "parameters", "ms_per_step")
+    )
+    sure = "**yes**" if effect["on"] else "no"
+    on = sure if effect["told"] else "yes, but cannot be told" if effect["on"] else "cannot be told"
+    gain, cost = effect["gain_db"], effect["ms_per_step"]
+    gains = (NONE if gain is None else f"{gain:.1f}", f"{gain / cost:.2g}" if gain and cost and cost > 0 else NONE)
+    return name, on, statistic, threshold, *gains, effect["reason"], parameters, milliseconds
 
 
 def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:
