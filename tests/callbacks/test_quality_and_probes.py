@@ -137,6 +137,18 @@ def test_scores_can_be_monitored(tmp_path):
     )
 
 
+def test_curves_are_drawn_at_ever_fewer_validations_and_at_the_test(tmp_path, monkeypatch):
+    drawn = []
+    draw = TemperatureCurves._draw
+    monkeypatch.setattr(TemperatureCurves, "_draw", lambda self, *given: (drawn.append(given[1:]), draw(self, *given)))
+    module = FakeModule(wall(), tmp_path)
+    job = trainer(tmp_path, [TemperatureCurves(times=3)], steps=18, every=2)
+    fit(module, job)
+    assert drawn == [(step, "probes") for step in (2, 4, 8, 16)]
+    evaluate(module, job)
+    assert drawn[4:] == [(18, "test/probes")] and (tmp_path / "renders" / "probes.png").exists()
+
+
 def test_panels_without_logger_and_bounds(tmp_path):
     scored(wall(thermal_range=None), tmp_path, ImagePanels(test_views=-1), TemperatureCurves(times=4))
     assert len(list((tmp_path / "renders" / "test").glob("*.png"))) == 4

@@ -38,7 +38,7 @@ class Probe:
 
 class TemperatureCurves(pl.Callback):
     """Draws the temperature of probe points over time into TensorBoard and renders/probes.png, the numbers into .csv and the
-    places of the points into renders/probe_positions.csv.
+    places of the points into renders/probe_positions.csv: at the first, second, fourth, eighth, ... validation, and at the test.
 
     The model's curve is the value of the rendered pixel on which the probe falls, seen from one validation camera at
     all times. The truth is the scene's own where it is synthetic; elsewhere dots show what the training images recorded
@@ -55,9 +55,13 @@ class TemperatureCurves(pl.Callback):
         self.count, self.times = count, times
         self._probes: list[Probe] | None = None
         self._dots: list[tuple[list[float], list[float]]] = []
+        self._validations = 0
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        if not trainer.sanity_checking:
+        if trainer.sanity_checking:
+            return
+        self._validations += 1
+        if self._validations.bit_count() == 1:  # at each of them, it would take a tenth of a short run
             self._draw(module, trainer.global_step, "probes")
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
