@@ -318,6 +318,9 @@ class ViewSet(Sequence[View]):
         self.frames = tuple(frames)
         self._decode = decode
 
+    def __repr__(self) -> str:
+        return f"ViewSet of {counted(len(self), 'view')}"
+
     def __len__(self) -> int:
         return len(self.frames)
 
