@@ -62,6 +62,10 @@ class Silent(DensityControl):
         cloud.keep(torch.arange(len(cloud)) > 4)
 
 
+class Misspelt(Static):
+    needs = frozenset({"times"})
+
+
 class Flat(Static):
     def features(self, splats, query):
         return super().features(splats, query)[:, 0]
@@ -107,6 +111,11 @@ def test_parameters_without_a_gradient_are_warned_of_at_the_end(tmp_path, caplog
 def test_emission_that_is_not_finite_is_named_before_the_gradients_of_the_geometry(tmp_path):
     with pytest.raises(NotFinite, match=r"step 1: what Broken.features returns has \d+ NaN"):
         trained(Broken(), tmp_path)
+
+
+def test_metadata_that_no_scene_can_have_are_named(tmp_path):
+    with pytest.raises(ValueError, match="each of Misspelt.needs must be one of time, thermal_range, .*, got 'times'"):
+        trained(Misspelt(), tmp_path)
 
 
 def test_emission_of_another_shape_names_the_model(tmp_path):
