@@ -29,7 +29,7 @@ from heatsplat.io.files import size_told, write_atomically
 from heatsplat.io.results import FAILED, METRICS_FILE
 from heatsplat.runs.lock import OccupiedError, locked
 from heatsplat.runs.signals import stoppable
-from heatsplat.training.machine import loading, prepare_machine
+from heatsplat.training.machine import clear_away, loading, prepare_machine
 from heatsplat.usage import usage
 
 if TYPE_CHECKING:
@@ -230,6 +230,8 @@ def train(config: dict[str, Any], output_dir: Path) -> float | None:
     launcher = HydraConfig.get().runtime.choices.launcher
     if launcher not in (None, "basic") and HydraConfig.get().mode != RunMode.MULTIRUN:
         log.warning("launcher=%s starts the jobs of a sweep; this single run trains right here: add -m", launcher)
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        clear_away()
     if (first := config.get("table", {}).get("after")) is not None:
         check_first(first)
     return train_in(config, output_dir).test.get("psnr")

@@ -204,12 +204,14 @@ def test_render_writes_temperatures_pictures_and_a_video(finished, told):
     assert (folder / "video.mp4").stat().st_size > 1000
 
 
-def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path, told):
+def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path, told, monkeypatch):
+    cleared = []
+    monkeypatch.setattr(cli, "clear_away", lambda: cleared.append(True))  # before each job, whose memory is measured
     output = told(
         "train", "-m", "method=3dgs", "init.opacity=2.0,0.1", *TINY, "max_steps=4", "doctor=false", "test=false",
         f"hydra.sweep.dir={tmp_path}/sweep", cwd=tmp_path, code=1,
     )  # fmt: skip
-    assert "init.opacity must lie in (0, 1)" in output
+    assert "init.opacity must lie in (0, 1)" in output and len(cleared) == 2
     jobs = [path for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
     failed = [path for path in jobs if (path / "FAILED").exists()]
     assert len(jobs) == 2 and len(failed) == 1  # the first
