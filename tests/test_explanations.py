@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hydra.errors import ConfigCompositionException, OverrideParseException
+from hydra.errors import ConfigCompositionException, InstantiationException, OverrideParseException
 
 from heatsplat import composition
 from heatsplat.explanations import _quoted, expected, explain, sentence
@@ -54,6 +54,22 @@ def test_no_number_or_text_of_a_command_has_the_name_of_a_group(path):
     groups = {folder.name for folder in (ROOT / "conf").iterdir() if folder.is_dir()}
     settings = yaml.safe_load(path.read_text())
     assert [key for key, value in settings.items() if key in groups and not isinstance(value, dict)] == []
+
+
+@pytest.mark.parametrize(
+    ("told", "printed"),
+    [
+        ("every must be 1 or more", "density: every must be 1 or more"),
+        ("density.every must be 1 or more", "density.every must be 1 or more"),
+    ],
+)
+def test_a_setting_that_a_class_of_the_user_refuses_needs_no_traceback(told, printed):
+    error = InstantiationException("Error in call to target 'mine.Unseen'\nfull_key: density")
+    error.__cause__ = ValueError(told)  # raised by code that is none of ours
+    assert expected(error) is error and sentence(error) == printed
+    assert explain(error, "train", ["density=unseen"]) == printed
+    error.__cause__ = RuntimeError("anything else")
+    assert expected(error) is None
 
 
 def test_a_page_with_few_training_cameras_can_be_asked_for():

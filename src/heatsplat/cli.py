@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -29,7 +29,7 @@ from heatsplat.io.files import size_told, write_atomically
 from heatsplat.io.results import FAILED, METRICS_FILE
 from heatsplat.runs.lock import OccupiedError, locked
 from heatsplat.runs.signals import stoppable
-from heatsplat.training.machine import loading, prepare_machine
+from heatsplat.training.machine import clear_away, loading, prepare_machine
 from heatsplat.usage import usage
 
 if TYPE_CHECKING:
@@ -38,6 +38,16 @@ if TYPE_CHECKING:
 log = logging.getLogger("heatsplat")
 
 ALL_OF_IT = "HYDRA_FULL_ERROR"  # the environment variable with which errors come with all that Hydra knows of them
+
+# Flags of Hydra; all else is a setting.
+ALONE = (
+    "--help", "-h", "--hydra-help", "--version", "--resolve", "--run", "-r", "--multirun", "-m", "--shell-completion", "-sc",
+)  # fmt: skip
+WITH_VALUE = (
+    "--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd",
+    "--experimental-rerun", "--info", "-i",
+)  # fmt: skip
+OPTIONAL = ("--info", "-i")  # whose value may be missing
 
 EXAMPLES = {
     "train": (
@@ -86,6 +96,7 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
             ]
             print("\n".join([*lines, "", f"{script} --help lists what can be set."]))
             sys.exit(2)
+        sys.argv[1:] = _settings_first(sys.argv[1:])
         all_of_it = ALL_OF_IT in os.environ
         os.environ[ALL_OF_IT] = "1"  # Hydra raises what it would print otherwise
         try:
@@ -109,6 +120,30 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
                 del os.environ[ALL_OF_IT]
 
     return command
+
+
+def _settings_first(arguments: Sequence[str]) -> list[str]:
+    """The arguments in an order that Hydra takes: settings have to stand together, and flags with their values follow.
+
+    Raises:
+        SystemExit: there is no such flag, as of --seed=1; with a sentence.
+    """
+    settings, flags, left = [], [], list(arguments)
+    while left:
+        word = left.pop(0)
+        if not word.startswith("-"):
+            settings.append(word)
+            continue
+        name, given, _ = word.partition("=")
+        full = name[:2] == "--"  # may be cut short
+        known = next((flag for flag in (*ALONE, *WITH_VALUE) if flag == name or (full and flag.startswith(name))), None)
+        if known is None:
+            meant = word.lstrip("-") if given else f"{name.lstrip('-')}=..."
+            sys.exit(f"{name} is no flag of this command: settings have no dashes, as in {meant} (--help lists them)")
+        flags.append(word)
+        if known in WITH_VALUE and not given and left and not (known in OPTIONAL and "=" in left[0]):
+            flags.append(left.pop(0))
+    return [*settings, *flags]
 
 
 def _job(
@@ -195,6 +230,8 @@ def train(config: dict[str, Any], output_dir: Path) -> float | None:
     launcher = HydraConfig.get().runtime.choices.launcher
     if launcher not in (None, "basic") and HydraConfig.get().mode != RunMode.MULTIRUN:
         log.warning("launcher=%s starts the jobs of a sweep; this single run trains right here: add -m", launcher)
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        clear_away()
     if (first := config.get("table", {}).get("after")) is not None:
         check_first(first)
     return train_in(config, output_dir).test.get("psnr")

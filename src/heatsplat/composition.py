@@ -43,7 +43,7 @@ def compose(overrides: Sequence[str] = (), name: str = "train") -> dict[str, Any
     Raises:
         TypeError: the overrides are no list of texts.
     """
-    if isinstance(overrides, str) or not all(isinstance(text, str) for text in overrides):
+    if isinstance(overrides, str | Mapping) or not all(isinstance(text, str) for text in overrides):
         raise TypeError(
             f"compose takes a list of overrides, such as ['method=etgs', 'max_steps=2000'], got {overrides!r}"
         )

@@ -318,6 +318,9 @@ class ViewSet(Sequence[View]):
         self.frames = tuple(frames)
         self._decode = decode
 
+    def __repr__(self) -> str:
+        return f"ViewSet of {counted(len(self), 'view')}"
+
     def __len__(self) -> int:
         return len(self.frames)
 
@@ -339,6 +342,17 @@ class ViewSet(Sequence[View]):
     @property
     def times_s(self) -> list[float | None]:
         return [frame.time_s for frame in self.frames]
+
+
+METADATA = (
+    "time",
+    "thermal_range",
+    "ambient",
+    "metres",
+    "weather",
+    "labels",
+    "point_features",
+)  # that a scene may have
 
 
 @dataclass(frozen=True)
@@ -453,16 +467,16 @@ class SceneData:
     @property
     def metadata(self) -> frozenset[str]:
         """Names of the metadata that the scene has, in the vocabulary of ``ThermalModel.needs``."""
-        has = {
-            "time": all(t is not None for t in self.train.times_s) and len(self.train) > 0,
-            "thermal_range": self.thermal_range is not None,
-            "ambient": self.ambient_c is not None,
-            "metres": self.metres_per_unit is not None,
-            "weather": self.weather is not None,
-            "labels": self.labels is not None,
-            "point_features": self.point_features is not None,
-        }
-        return frozenset(name for name, there in has.items() if there)
+        has = (
+            all(t is not None for t in self.train.times_s) and len(self.train) > 0,
+            self.thermal_range is not None,
+            self.ambient_c is not None,
+            self.metres_per_unit is not None,
+            self.weather is not None,
+            self.labels is not None,
+            self.point_features is not None,
+        )
+        return frozenset(name for name, there in zip(METADATA, has, strict=True) if there)
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,7 @@ def explain(error: Exception, command: str, arguments: Sequence[str]) -> str | N
 
 def expected(error: BaseException) -> BaseException | None:
     """The error behind ``error`` that is the user's to mend and needs no traceback, or None."""
+    outer = error
     while error is not None:
         if isinstance(error, SceneError | FileNotFoundError | ImportError | FloatingPointError):
             return error
@@ -55,11 +56,13 @@ def expected(error: BaseException) -> BaseException | None:
         if isinstance(error, ValueError) and _raised_here(error):  # of a setting, once the scene is known
             return error
         error = error.__cause__
-    return None
+    return outer if _of_building(outer) else None  # of a class of the user's own
 
 
 def sentence(error: BaseException) -> str:
     """What is printed of an error that is the user's to mend."""
+    if told := _of_building(error):
+        return told
     remedy = NO_PLACE.get(error.errno) if isinstance(error, OSError) else None
     if remedy is None:
         return f"{type(error).__name__}: {error}"
@@ -68,18 +71,31 @@ def sentence(error: BaseException) -> str:
 
 def _of_composing(error: Exception, command: str, arguments: Sequence[str]) -> str | None:
     """What is printed of an error of Hydra, and of what it built; None for a mistake of ours."""
-    place = re.search(r"full_key: (\S+)", str(error)) if isinstance(error, InstantiationException) else None
+    if told := _of_building(error):
+        return told
     cause = error.__cause__
-    if place and isinstance(cause, ValueError):
-        return f"{place[1]}: {cause}"
-    if place and isinstance(cause, TypeError) and _of_settings(cause):
-        return f"{place[1]}: {cause} (HYDRA_FULL_ERROR=1 shows where)"
-    if place and cause is not None and _raised_here(cause) and expected(cause) is None:
+    if _place(error) and cause is not None and _raised_here(cause) and expected(cause) is None:
         return None
     meant = _meant(error, command, arguments)
     # Hydra offers to append a key that there is not, which nothing would read.
     told = re.sub(r"\nTo append to your config use \S+", "", str(error)) if meant else str(error)
     return "\n".join(filter(None, [told, str(cause or ""), meant]))
+
+
+def _of_building(error: BaseException) -> str | None:
+    """What is printed where a class did not take its settings; None for other errors."""
+    place, cause = _place(error), error.__cause__
+    if place and isinstance(cause, ValueError):
+        return str(cause) if str(cause).startswith(f"{place}.") else f"{place}: {cause}"
+    if place and isinstance(cause, TypeError) and _of_settings(cause):
+        return f"{place}: {cause} (HYDRA_FULL_ERROR=1 shows where)"
+    return None
+
+
+def _place(error: BaseException) -> str | None:
+    """Where in the configuration Hydra failed to build a class, such as "density"."""
+    found = re.search(r"full_key: (\S+)", str(error)) if isinstance(error, InstantiationException) else None
+    return found and found[1]
 
 
 def _raised_here(error: BaseException) -> bool:

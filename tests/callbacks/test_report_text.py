@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from heatsplat.callbacks.report import show
-from heatsplat.callbacks.report_text import _picture, effects_table, markdown
+from heatsplat.callbacks.report_text import _picture, cells, effects_table, markdown
 from heatsplat.io.page import page
 from heatsplat.io.results import RunResults
 
@@ -25,6 +25,12 @@ def test_names_are_shown_as_they_are(tmp_path, capsys):
     show(results, tmp_path / "[old]", tmp_path / "[old]" / "a [b].png")
     said = " ".join(capsys.readouterr().out.split())
     assert "[new](x)" in said and ":fire:" in said and "[old]/report.md" in said and "a [b].png" in said
+
+
+def test_a_score_of_an_own_callback_has_the_unit_of_its_definition():
+    definitions = {"rmse_c": "°C, lower is better: root", "sharpness": "higher is better: of edges"}
+    content = {"test": {"rmse_c": 3.907, "sharpness": 0.5, "psnr": 20.0, "other": None}, "definitions": definitions}
+    assert cells(content, "test") == [("rmse_c", "3.907 °C"), ("sharpness", "0.5"), ("psnr", "20 dB"), ("other", "–")]
 
 
 @pytest.mark.parametrize("name", ["IMG (1).png", "Bild#1 50%ü_[x].png", "a*b_c_`d`.png", "<b>.png"])

@@ -35,6 +35,14 @@ def test_keep_takes_the_same_rows_everywhere():
     assert torch.equal(cloud.state["seen"], torch.tensor([0.0, 2.0, 3.0]))
 
 
+@pytest.mark.parametrize("mask", [torch.tensor([0, 2, 3]), torch.ones(5, dtype=torch.bool)])
+def test_keep_refuses_what_is_no_mask_of_its_gaussians(mask):
+    cloud = make_cloud()
+    with pytest.raises(ValueError, match=r"cloud.keep takes a mask \[6\] bool of the Gaussians that stay, got torch\."):
+        cloud.keep(mask)
+    assert len(cloud) == 6
+
+
 def test_prune_tells_how_many_went_and_refuses_to_remove_all():
     cloud = make_cloud()
     assert cloud.prune(torch.tensor([True, False, True, True, False, True]), "none is left") == 2

@@ -19,6 +19,7 @@ import hydra
 import numpy as np
 import pytest
 from commands import succeeds
+from hydra._internal.utils import get_args_parser
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 from running import NO_PICTURES
@@ -203,12 +204,14 @@ def test_render_writes_temperatures_pictures_and_a_video(finished, told):
     assert (folder / "video.mp4").stat().st_size > 1000
 
 
-def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path, told):
+def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path, told, monkeypatch):
+    cleared = []
+    monkeypatch.setattr(cli, "clear_away", lambda: cleared.append(True))  # before each job, whose memory is measured
     output = told(
         "train", "-m", "method=3dgs", "init.opacity=2.0,0.1", *TINY, "max_steps=4", "doctor=false", "test=false",
         f"hydra.sweep.dir={tmp_path}/sweep", cwd=tmp_path, code=1,
     )  # fmt: skip
-    assert "init.opacity must lie in (0, 1)" in output
+    assert "init.opacity must lie in (0, 1)" in output and len(cleared) == 2
     jobs = [path for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
     failed = [path for path in jobs if (path / "FAILED").exists()]
     assert len(jobs) == 2 and len(failed) == 1  # the first
@@ -355,6 +358,29 @@ def test_an_option_of_other_methods_is_told_in_a_sentence(tmp_path, told):
     output = told("train", "method=etgs", "stages=fine_tuning", *TINY, "hydra.run.dir=run", cwd=tmp_path, code=1)
     assert (
         "stages=fine_tuning needs first_steps" in output and "Traceback" not in output and "object_type" not in output
+    )
+
+
+def test_flags_may_stand_among_settings():
+    given = ["method=etgs", "-m", "seed=0,1", "--config-dir", "/mine=2", "--info", "thermal=my_drift", "--cfg=job"]
+    flags = ["-m", "--config-dir", "/mine=2", "--info", "--cfg=job"]
+    assert cli._settings_first(given) == ["method=etgs", "seed=0,1", "thermal=my_drift", *flags]
+    parsed = get_args_parser().parse_args(cli._settings_first(given))
+    assert parsed.multirun and parsed.config_dir == "/mine=2" and parsed.info == "all" and parsed.cfg == "job"
+    assert cli._settings_first(["--multi", "~x", "a=-1"]) == ["~x", "a=-1", "--multi"]
+    known = {flag for action in get_args_parser()._actions for flag in action.option_strings}
+    assert known == {*cli.ALONE, *cli.WITH_VALUE}
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"), [(["--max_steps=7000"], "max_steps=7000 "), (["--seed", "1"], "seed=... "), (["-s"], "s=... ")]
+)
+def test_a_setting_with_dashes_is_told_how_it_is_written(typed, meant, tmp_path, told):
+    output = told("train", "method=etgs", *typed, cwd=tmp_path, code=1)
+    name = typed[0].partition("=")[0]
+    assert (
+        output.strip()
+        == f"{name} is no flag of this command: settings have no dashes, as in {meant}(--help lists them)"
     )
 
 

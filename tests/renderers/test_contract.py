@@ -798,7 +798,7 @@ def test_coordinates_of_a_million(backend):
 BAD = {
     "quats": (torch.zeros(5, 3), r"quats must have shape \[5, 4\], got \[5, 3\]"),
     "scales": (torch.zeros(4, 3), r"scales must have shape \[5, 3\], got \[4, 3\]"),
-    "opacities": (torch.zeros(4), r"opacities must have shape \[5\] or \[M, 5\], got \[1, 4\]"),
+    "opacities": (torch.zeros(4), r"opacities must have shape \[5\] or \[M, 5\], got \[4\]"),
     "features": (torch.zeros(3, 1), r"features must have shape \[5, C\], got \[3, 1\]"),
     "viewmats": (torch.eye(3), r"viewmats and Ks must be \[4, 4\] and \[3, 3\], got \[3, 3\] and \[3, 3\]"),
     "width": (0, "image must have pixels, got 0 x 20"),
@@ -809,13 +809,28 @@ BAD = {
         "background must be like means, torch.float32 on cpu, got torch.float64 on cpu",
     ),
     "signs": (torch.ones(4), r"signs must have shape \[5\], got \[4\]"),
-    "far": (0.001, "far must be beyond near, got near 0.01 and far 0.001"),
+    "far": (0.001, "near must be 0 or more, and far beyond it, got near 0.01 and far 0.001"),
     "Ks": (
         torch.tensor([[20.0, 0.5, 12.0], [0, 20, 10], [0, 0, 1]]),
         r"Ks has a skew of 0.5 \(its \[0, 1\]\), which no renderer has",
     ),
     "backend": ("cuda", "unknown renderer backend 'cuda'; there are reference, cpu, gsplat and auto"),
 }
+
+
+OF_OTHER_TYPES = [
+    ({"means": np.zeros((5, 3), np.float32)}, "means must be a tensor, got numpy.ndarray: torch.as_tensor makes one"),
+    ({"means": torch.tensor(1.0)}, r"means must have shape \[0, 3\], got \[\]"),
+    ({"opacities": None}, "opacities must be a tensor, got NoneType"),
+    ({"background": 0.3}, "background must be a tensor, got float"),
+    ({"viewmats": np.eye(4)}, "viewmats must be a tensor, got numpy.ndarray"),
+    ({"Ks": np.eye(3)}, "Ks must be a tensor, got numpy.ndarray"),
+    ({"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None]}, r"one camera per call, such as viewmats\[0\], Ks\[0\]"),
+    ({"viewmats": torch.full((4, 4), torch.nan)}, "viewmats has NaN or infinite values"),
+    ({"Ks": torch.zeros(3, 3)}, r"Ks needs fx and fy above 0 pixels \(its \[0, 0\] and \[1, 1\]\), got 0 and 0"),
+    ({"near": -1.0}, "near must be 0 or more, and far beyond it, got near -1.0"),
+    ({"width": 24.0}, "width and height must be whole numbers of pixels, got 24.0 and 20"),
+]  # fmt: skip
 
 
 def arguments(**changed: Any) -> dict[str, Any]:
@@ -833,6 +848,17 @@ def test_bad_arguments_are_named(name):
     rasterization(**arguments())
     with pytest.raises(ValueError, match=message):
         rasterization(**arguments(**{name: value}))
+
+
+@pytest.mark.parametrize(("changed", "message"), OF_OTHER_TYPES)
+def test_arguments_of_other_types_and_cameras_that_are_none_are_named(changed, message):
+    with pytest.raises(ValueError, match=message):
+        rasterization(**arguments(**changed))
+
+
+def test_sizes_of_numpy_are_whole_numbers():
+    found = rasterization(**arguments(width=np.int64(24), height=np.int64(20)))
+    assert torch.equal(found.features, rasterization(**arguments()).features)
 
 
 def test_gsplat_refuses_to_leave_the_intrinsics_without_a_gradient():

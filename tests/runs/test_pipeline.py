@@ -48,6 +48,13 @@ def test_a_notebook_composes_trains_loads_and_looks_at_temperatures(trained):
     assert celsius.shape == (frame.camera.height, frame.camera.width)
     assert bounds.min_c <= celsius.min() and celsius.max() <= bounds.max_c
     assert torch.equal(scene.render(frame.camera, 0.0, "keep"), celsius)  # static splats know no time
+    assert torch.equal(scene.render(frame.camera, torch.tensor(5.0), "keep"), celsius)
+    with pytest.raises(TypeError, match="camera must be a Camera or a Frame, .* or view.frame, got View"):
+        scene.render(scene.scene.test[0])
+    for time_s in ("10min", [0.0, 1.0], math.nan):
+        with pytest.raises(ValueError, match="time_s must be a number, got"):
+            scene.render(frame.camera, time_s)
+    assert "train=ViewSet of 7 views" in repr(scene.scene) and len(repr(scene)) < 2000
 
 
 def test_pictures_of_rendered_images_are_not_called_recorded(trained, monkeypatch):
@@ -128,7 +135,7 @@ def test_another_program_that_uses_hydra_composes_ours_and_goes_on_with_its_own(
         assert hydra.compose("theirs").mine == 1 and HydraConfig.get().job.config_name == "theirs"
 
 
-@pytest.mark.parametrize("overrides", ["method=etgs", [1]])
+@pytest.mark.parametrize("overrides", ["method=etgs", [1], {"method": "etgs"}])
 def test_overrides_that_are_no_list_of_texts_are_refused(overrides):
     with pytest.raises(TypeError, match="compose takes a list of overrides"):
         heatsplat.compose(overrides)

@@ -323,6 +323,19 @@ def test_a_part_that_is_none_is_absent_and_an_empty_chain_gives_back_its_image()
     assert SensorChain({"tone": None}).regularisers() == {}
 
 
+@pytest.mark.parametrize(
+    ("returned", "told"),
+    [(lambda image: image[..., 0], r"a tensor of shape \[\d+, \d+\]"), (lambda image: None, "of type NoneType")],
+)
+def test_a_part_that_returns_no_image_is_named(returned, told):
+    class Mistaken(SensorPart):
+        def forward(self, image, frame):
+            return returned(image)
+
+    with pytest.raises(ValueError, match=rf"sensor part Mistaken returned is {told}; it must be an image \[H, W, 1\]"):
+        SensorChain({"mistaken": Mistaken()})(noise(), FRAME)
+
+
 def test_the_whole_chain_is_the_identity_at_first_and_names_its_regularisers():
     chain = SensorChain({name: ready(name) for name in ("calibration", "agc", "tone")})
     image = noise()

@@ -71,6 +71,33 @@ def test_a_bad_file_is_named_with_its_remedy(root, submission, spoil, message):
         score_submission(submission, root, SCORES)
 
 
+def test_scenes_come_in_the_order_of_the_protocol_and_those_that_are_missing_are_told(root, submission, tmp_path):
+    protocol_folder(root, "glass", "driven")
+    hand_in(submission / "glass", 0.5)
+    (submission / "metrics.json").write_text('{"method": "ours", "scenes": {"glass": null, "cooling": null}}')
+    assert list(run(tmp_path / "out", str(submission), str(root), PROTOCOL)) == ["cooling", "glass"]
+    assert (
+        "\n- not handed in, as metrics.json does not name them: driven\n" in (tmp_path / "out" / "score.md").read_text()
+    )
+
+
+def test_greys_are_warned_of_as_most_lie_outside_of_the_bounds(root, submission, caplog):
+    score_submission(submission, root, SCORES)
+    assert not caplog.records
+    for view in VIEWS:
+        write_temperature(submission / "cooling" / f"{view}.tiff", (truth(view) - 15) / 30 * 255)
+    score_submission(submission, root, SCORES)
+    assert "cooling: 100 % of the pixels lie outside of 15 to 45 °C, the camera's bounds, " in caplog.text
+
+
+def test_a_track_that_the_protocol_does_not_have_is_refused(root, submission, tmp_path):
+    (submission / "metrics.json").write_text('{"method": "ours", "track": "step", "scenes": {"cooling": null}}')
+    with pytest.raises(
+        SceneError, match='metrics.json: "track" is step; the protocol has steps, seconds. Name one of them'
+    ):
+        run(tmp_path, str(submission), str(root), PROTOCOL)
+
+
 def test_a_submission_tells_its_method_and_its_scenes(root, submission, tmp_path):
     for told, message in (
         ("{", "is no JSON"),

@@ -4,6 +4,7 @@ import gc
 import os
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,21 @@ def test_the_command_line_counts_by_the_same_rule_and_loads_nothing_heavy_for_it
     heavy = "{'torch', 'numba', 'pytorch_lightning'} & set(sys.modules)"
     told = f"import sys, heatsplat.cli; heatsplat.compose; sys.exit(bool({heavy}))"
     assert subprocess.run([sys.executable, "-c", told], env={**os.environ, "PYTHONPATH": str(SRC)}).returncode == 0
+
+
+def test_what_an_earlier_job_left_behind_is_cleared_away(monkeypatch):
+    job = torch.nn.Module()
+    job.itself, seen = [job], weakref.ref(job)
+    gc.disable()  # so that nothing else finds it
+    try:
+        del job
+        assert seen() is not None
+        machine.clear_away()
+        assert seen() is None
+    finally:
+        gc.enable()
+    monkeypatch.setattr(machine.ctypes, "CDLL", lambda name: object())  # a system without malloc_trim
+    machine.clear_away()
 
 
 def test_libraries_are_left_out_of_the_search_for_garbage_once(monkeypatch):

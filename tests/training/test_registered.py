@@ -52,6 +52,30 @@ class Emptying(DensityControl):
         return DensityChange(removed=count)
 
 
+class Yes(DensityControl):
+    def refine(self, cloud, step, extent, generator):
+        return True
+
+
+class Silent(DensityControl):
+    def refine(self, cloud, step, extent, generator):
+        cloud.keep(torch.arange(len(cloud)) > 4)
+
+
+class Misspelt(Static):
+    needs = frozenset({"times"})
+
+
+class Flat(Static):
+    def features(self, splats, query):
+        return super().features(splats, query)[:, 0]
+
+
+class Everywhere(Static):
+    def features(self, splats, query):
+        return splats["sh0"].new_zeros(len(splats), 1)
+
+
 class Short(DensityControl):
     def initial_state(self, count, device):
         return {"seen": torch.zeros(3)}
@@ -89,8 +113,27 @@ def test_emission_that_is_not_finite_is_named_before_the_gradients_of_the_geomet
         trained(Broken(), tmp_path)
 
 
+def test_metadata_that_no_scene_can_have_are_named(tmp_path):
+    with pytest.raises(ValueError, match="each of Misspelt.needs must be one of time, thermal_range, .*, got 'times'"):
+        trained(Misspelt(), tmp_path)
+
+
+def test_emission_of_another_shape_names_the_model(tmp_path):
+    told = r"{}.features returns must be \[(\d+), 1\], a row for each Gaussian in view .*, got \[{}\]"
+    with pytest.raises(ValueError, match=told.format("Flat", r"\1")):
+        trained(Flat(), tmp_path / "flat")
+    with pytest.raises(ValueError, match=told.format("Everywhere", r"\d+, 1")):
+        trained(Everywhere(), tmp_path / "everywhere")
+
+
 def test_density_control_that_leaves_nothing_or_has_other_rows_is_named(tmp_path):
     with pytest.raises(SceneError, match="Emptying removed all Gaussians in step 1"):
         trained(Static(), tmp_path / "emptying", Emptying())
+    with pytest.raises(ValueError, match="Yes.refine returned True: return DensityChange"):
+        trained(Static(), tmp_path / "yes", Yes())
+    with pytest.raises(
+        ValueError, match="Silent.refine returned None and left 5 Gaussians fewer: return DensityChange"
+    ):
+        trained(Static(), tmp_path / "silent", Silent())
     with pytest.raises(ValueError, match=r"'seen' of Short.initial_state is \[3\]; it needs a row for each of the \d+"):
         trained(Static(), tmp_path / "short", Short())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from itertools import chain, zip_longest
 from pathlib import Path
@@ -194,7 +195,8 @@ def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:
     """Names and values of "test" or "cost" with their units, for a table; a dash for what could not be had."""
     cells = []
     for name, value in content[section].items():
-        unit = quantity.unit if (quantity := described(name)) is not None else ""
+        own = re.match(r"(\S+), (?:lower|higher) is better", str(content.get("definitions", {}).get(name, "")))
+        unit = quantity.unit if (quantity := described(name)) is not None else own[1] if own else ""
         cells.append((name, NONE if value is None else f"{_number(value)} {unit}".rstrip()))
     return cells
 

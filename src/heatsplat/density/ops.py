@@ -98,7 +98,15 @@ class Cloud:
         self.splats.place(name, kept)
 
     def keep(self, mask: Tensor) -> None:
-        """Removes the Gaussians where ``mask`` [N] bool is False, with their moments and statistics."""
+        """Removes the Gaussians where ``mask`` [N] bool is False, with their moments and statistics.
+
+        Raises:
+            ValueError: the mask is something else, such as ids.
+        """
+        if mask.dtype != torch.bool or tuple(mask.shape) != (len(self),):
+            raise ValueError(
+                f"cloud.keep takes a mask [{len(self)}] bool of the Gaussians that stay, got {mask.dtype} {list(mask.shape)}"
+            )
         ids = mask.nonzero().squeeze(1)
         for name in self.splats.names:
             places, rows = self.splats.places(name), ids

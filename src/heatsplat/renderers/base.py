@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
+from numbers import Integral
 
 import torch
 from torch import Tensor
@@ -101,12 +102,13 @@ def rasterization(
         RenderOutput with features [H, W, C], alpha [M, H, W], depth [H, W] or None, and meta.
 
     Raises:
-        ValueError: shapes, types or devices do not fit together, eps2d is not positive, far is not beyond near, the
-            intrinsics have skew or want a gradient of "gsplat", or the backend is unknown.
+        ValueError: shapes, types or devices do not fit together, eps2d is not positive, near is negative or far not beyond it,
+            a camera on the CPU is not finite or has no focal length, the intrinsics have skew or want a gradient of "gsplat", or
+            the backend is unknown.
         ImportError: the backend is gsplat and it is not installed (the message says how to get it).
     """
-    opacities = opacities[None] if opacities.ndim == 1 else opacities
     _check_gaussians(means, quats, scales, opacities, features, background, signs)
+    opacities = opacities[None] if opacities.ndim == 1 else opacities
     _check_modalities(modality_channels, len(opacities))
     _check_camera(viewmats, Ks, width, height, near, far, eps2d)
     backend = _backend_of(backend, means, Ks)
@@ -138,17 +140,26 @@ def _check_gaussians(
     background: Tensor | None,
     signs: Tensor | None,
 ) -> None:
-    n = means.shape[0]
+    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
+    given |= {"background": background, "signs": signs}
+    for name, value in given.items():
+        missing = value is None and name in ("background", "signs")
+        if not (missing or isinstance(value, Tensor) or (name == "features" and callable(value))):
+            raise ValueError(f"{name} must be a tensor, got {_of_type(value)}: torch.as_tensor makes one")
+    n = means.shape[0] if means.ndim else 0
     for name, tensor, shape in (("means", means, (n, 3)), ("quats", quats, (n, 4)), ("scales", scales, (n, 3))):
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} must have shape {list(shape)}, got {list(tensor.shape)}")
-    if opacities.ndim != 2 or opacities.shape[1] != n:
+    if opacities.ndim not in (1, 2) or opacities.shape[-1] != n:
         raise ValueError(f"opacities must have shape [{n}] or [M, {n}], got {list(opacities.shape)}")
     if means.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"Gaussians must be float32 or float64, got means of {means.dtype}")
-    given = {"quats": quats, "scales": scales, "opacities": opacities, "features": features, "background": background}
     for name, tensor in given.items():
-        if isinstance(tensor, Tensor) and (tensor.dtype != means.dtype or tensor.device != means.device):
+        if (
+            name != "signs"
+            and isinstance(tensor, Tensor)
+            and (tensor.dtype != means.dtype or tensor.device != means.device)
+        ):
             raise ValueError(
                 f"{name} must be like means, {means.dtype} on {means.device}, got {tensor.dtype} on {tensor.device}"
             )
@@ -166,17 +177,35 @@ def _check_modalities(channels: Sequence[int] | None, modalities: int) -> None:
 
 
 def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, near: float, far: float, eps2d: float) -> None:
+    for name, matrix in (("viewmats", viewmats), ("Ks", Ks)):
+        if not isinstance(matrix, Tensor):
+            raise ValueError(f"{name} must be a tensor, got {_of_type(matrix)}: torch.as_tensor makes one")
     if tuple(viewmats.shape) != (4, 4) or tuple(Ks.shape) != (3, 3):
-        raise ValueError(f"viewmats and Ks must be [4, 4] and [3, 3], got {list(viewmats.shape)} and {list(Ks.shape)}")
-    # On a GPU a look at it would wait for the device.
-    if Ks.device.type == "cpu" and (skew := float(Ks.detach()[0, 1])):
-        raise ValueError(f"Ks has a skew of {skew:.6g} (its [0, 1]), which no renderer has: undistort images to 0")
+        batch = ": one camera per call, such as viewmats[0], Ks[0]" if viewmats.ndim == 3 or Ks.ndim == 3 else ""
+        raise ValueError(
+            f"viewmats and Ks must be [4, 4] and [3, 3], got {list(viewmats.shape)} and {list(Ks.shape)}{batch}"
+        )
+    # On a GPU a look at them would wait for the device.
+    if Ks.device.type == "cpu":
+        (fx, skew, _), (_, fy, _), _ = Ks.detach().tolist()
+        if skew:
+            raise ValueError(f"Ks has a skew of {skew:.6g} (its [0, 1]), which no renderer has: undistort images to 0")
+        if not (fx > 0 and fy > 0):
+            raise ValueError(f"Ks needs fx and fy above 0 pixels (its [0, 0] and [1, 1]), got {fx:.6g} and {fy:.6g}")
+    if viewmats.device.type == "cpu" and not bool(viewmats.detach().isfinite().all()):
+        raise ValueError("viewmats has NaN or infinite values")
     if not eps2d > 0:
         raise ValueError(f"eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1), got {eps2d}")
-    if not near < far:
-        raise ValueError(f"far must be beyond near, got near {near} and far {far}")
+    if not 0 <= near < far:
+        raise ValueError(f"near must be 0 or more, and far beyond it, got near {near} and far {far}")
+    if not (isinstance(width, Integral) and isinstance(height, Integral)):
+        raise ValueError(f"width and height must be whole numbers of pixels, got {width!r} and {height!r}")
     if width < 1 or height < 1:
         raise ValueError(f"image must have pixels, got {width} x {height}")
+
+
+def _of_type(value: object) -> str:
+    return f"{type(value).__module__}.{type(value).__qualname__}".removeprefix("builtins.")
 
 
 def _backend_of(asked: str, means: Tensor, Ks: Tensor) -> str:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.composition import build, scene_name
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_option
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numbers, check_option
 from heatsplat.doctor.examination import FINDINGS_FILE, warn_of, write_findings
 from heatsplat.geometry.coverage import Sighting, covered
 from heatsplat.io.results import RunResults, checkpoint_of
@@ -166,10 +166,10 @@ class Trained:
         checkpoint: all of it.
     """
 
-    config: dict[str, Any]
+    config: dict[str, Any] = field(repr=False)  # pages of text, as the checkpoint is
     module: SplatTraining
     data: Any
-    checkpoint: dict[str, Any]
+    checkpoint: dict[str, Any] = field(repr=False)
     _warned: bool = field(default=False, init=False, repr=False, compare=False)  # of moments beyond the record
 
     @property
@@ -190,9 +190,18 @@ class Trained:
 
         Raises:
             SceneError: the scene's weather is not known at that time.
-            ValueError: ``unseen`` is neither.
+            TypeError: ``camera`` is neither a camera nor a frame, such as a view.
+            ValueError: ``unseen`` is neither, or ``time_s`` is no finite number.
         """
         check_option("unseen", unseen, UNSEEN)
+        if not isinstance(camera, Camera | Frame):
+            raise TypeError(
+                f"camera must be a Camera or a Frame, such as scene.test.frames[0] or view.frame, got {type(camera).__name__}"
+            )
+        if isinstance(time_s, Tensor) and time_s.numel() == 1:
+            time_s = time_s.item()
+        if time_s is not None:
+            check_numbers("time_s", time_s)
         frame = camera if isinstance(camera, Frame) else Frame("view", first_free_id(self.scene), camera)
         frame = frame if time_s is None else at_time(self.scene, frame, time_s)
         self._warned = self._warned or warn_beyond_record(self.scene, [frame], self.module.thermal.beyond_record)

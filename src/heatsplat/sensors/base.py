@@ -77,9 +77,22 @@ class SensorChain(nn.Module):
 
         Args:
             depth: [H, W] of what is seen (camera z), infinite where nothing is; where ``needs_depth``.
+
+        Raises:
+            ValueError: a part returned no image of as many channels.
         """
         for part in self.parts.values():
-            image = part(image, frame, depth) if part.needs_depth else part(image, frame)
+            seen = part(image, frame, depth) if part.needs_depth else part(image, frame)
+            if not (isinstance(seen, Tensor) and seen.ndim == 3 and seen.shape[2] == image.shape[2]):
+                told = (
+                    f"a tensor of shape {list(seen.shape)}"
+                    if isinstance(seen, Tensor)
+                    else f"of type {type(seen).__name__}"
+                )
+                raise ValueError(
+                    f"what sensor part {type(part).__name__} returned is {told}; it must be an image [H, W, {image.shape[2]}]"
+                )
+            image = seen
         return image
 
     def regularisers(self) -> dict[str, Tensor]:

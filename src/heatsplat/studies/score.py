@@ -27,6 +27,7 @@ META, SCENES, TRUTH = "meta.json", "scenes", "truth"
 ENDINGS = (".tiff", ".tif", ".npy")
 COSTS = ("seconds", "memory_mb", "gaussians")  # of a scene, in a submission's metrics.json
 ABSOLUTE_ZERO_C = -273.15
+MANY = 0.2  # share of a scene's pixels outside of the camera's bounds from which on they may be no °C
 
 
 @dataclass(frozen=True)
@@ -74,15 +75,24 @@ def score_scene(handed_in: Path, scene: Path, truth: Path, scores: Sequence[str]
             f"{', '.join(missing[:5])}{more}. Render every view of {scene / 'transforms_test.json'} and write it to "
             f"{handed_in}/<view>.tiff (or .npy)"
         )
-    scorer, rows = Scorer(bounds), []
+    scorer, rows, outside = Scorer(bounds), [], []
     for name, file in files.items():
         exact = read_temperature(truth / f"{name}.tiff")
         images = (checked(file, exact.shape, bounds), exact)
         prediction, target = (
             torch.from_numpy(bounds.to_unit(image.astype(np.float64))).float()[..., None] for image in images
         )
+        outside.append(((prediction < 0) | (prediction > 1)).float().mean().item())
         found = scorer(prediction.clamp(0, 1), target)
         rows.append({"name": name, "part": name.partition("_")[0], **{score: found[score] for score in scores}})
+    if (share := sum(outside) / len(outside)) > MANY:
+        log.warning(
+            "%s: %.0f %% of the pixels lie outside of %g to %g °C, the camera's bounds, and count as these: are they °C?",
+            handed_in,
+            100 * share,
+            bounds.min_c,
+            bounds.max_c,
+        )
     return SceneScore(rows)
 
 
@@ -201,14 +211,22 @@ def run(
         protocol: conf/protocol.
 
     Raises:
-        SceneError: a folder is not given, or see ``score_submission``.
+        SceneError: a folder is not given, the protocol has no such track, or see ``score_submission``.
     """
     if submission is None or root is None:
         raise SceneError(
             "give the folder of renders and that of the protocol's scenes: submission=FOLDER root=FOLDER (docs/protocol.md)"
         )
     output_dir, scores = Path(output_dir), list(protocol["scores"])
-    told, found = score_submission(Path(submission).expanduser(), Path(root).expanduser(), scores)
+    folder, root = Path(submission).expanduser(), Path(root).expanduser()
+    if (track := read_submission(folder).get("track")) not in (None, *protocol["tracks"]):
+        raise SceneError(
+            f'{folder / METRICS_FILE}: "track" is {track}; the protocol has {", ".join(protocol["tracks"])}. Name one of them '
+            "there, or leave it out"
+        )
+    told, found = score_submission(folder, root, scores)
+    order = [*protocol["scenes"], *scenes_in(root)]
+    found = {scene: found[scene] for scene in sorted(found, key=order.index)}
     rows, head = (
         [],
         ["scene", "part", "views", *(f"{name} ({DEFINITIONS[name].unit or '-'})" for name in scores), *COSTS],
@@ -221,6 +239,8 @@ def run(
             rows.append([scene, part or "all", count, *cells, *costs])
     lines = [f"# {told['method']}", "", *markdown_table(head, rows, "ll" + "r" * (len(head) - 2)), ""]
     lines += [f"- {name}: {DEFINITIONS[name].better} is better; {DEFINITIONS[name].sentence}" for name in scores]
+    if left := [scene for scene in scenes_in(root) if scene not in found]:
+        lines.append(f"- not handed in, as {METRICS_FILE} does not name them: {', '.join(left)}")
     write_atomically(output_dir / "score.md", "\n".join([*lines, ""]))
     write_csv(
         output_dir / "score.csv", [{"scene": scene, **row} for scene, score in found.items() for row in score.views]

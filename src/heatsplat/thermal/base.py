@@ -11,13 +11,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from heatsplat.contracts import Camera, Course, SceneData, SceneError
+from heatsplat.contracts import METADATA, Camera, Course, SceneData, SceneError, check_option
 from heatsplat.splats import GAUSSIANS, Splats
 
 NORMALS = "normals"  # the tensor that ``surface_normals`` declares
 # Tensors that training fills where a model declares them, and new Gaussians inherit: shares [N, D] of the sun from the D
 # directions of ``geometry.exposure.sun_directions``, and [N] of the sky (heatsplat.training.exposure).
 SUN_SEEN, SKY_SEEN = "sun_seen", "sky_seen"
+TIMES = ", times by data.time_csv or data.time_regex (docs/your_own_data.md)"
 KELVIN_RANGE = 0.01  # K; float32 holds 300 K to 3e-5 K, a three-hundredth of it. Cameras have noise of 0.03 K and more.
 
 
@@ -167,13 +168,15 @@ class Heat(nn.Module, ABC):
 
     def check(self, scene: SceneData) -> None:
         """Raises SceneError, naming the model and what is missing, when the scene lacks metadata in ``needs`` or its range
-        is too narrow. Called once, before ``prepare``."""
+        is too narrow; ValueError when there is no such metadata. Called once, before ``prepare``."""
+        for name in sorted(self.needs):
+            check_option(f"each of {type(self).__name__}.needs", name, METADATA)
         missing = sorted(self.needs - scene.metadata)
         if missing:
             raise SceneError(
                 f"{type(self).__name__} needs {', '.join(missing)}, which scene '{scene.name}' does not have "
                 f"(it has: {', '.join(sorted(scene.metadata)) or 'images only'}). Choose a method that does without, "
-                "or give the data set the missing metadata."
+                f"or give the data set the missing metadata{TIMES if 'time' in missing else ''}."
             )
         if scene.thermal_range is not None and scene.thermal_range.span_k < self.narrowest_range_k:
             raise SceneError(

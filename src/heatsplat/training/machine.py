@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import logging
 import os
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 # Lightning's remarks that no user can act on: workers, its products, a deprecation of torch, checkpoints of another
 # folder or with other callbacks, SLURM where a run was started by hand, loaders that cannot resume (ours takes the step
@@ -56,6 +57,15 @@ def loading() -> Iterator[None]:
     finally:
         gc.freeze()
         gc.enable()
+
+
+def clear_away() -> None:
+    """Gives the system the memory that earlier jobs of a process have left, which would count as a later job's."""
+    gc.collect()
+    with suppress(
+        OSError, AttributeError, TypeError
+    ):  # glibc keeps what is free in between; others have no such function
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def prepare_machine(threads: int | None) -> None:

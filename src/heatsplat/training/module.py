@@ -362,7 +362,9 @@ class SplatTraining(SceneModel):
         self.overlap.shrink(cloud, here)
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)
+        before = len(self.splats)
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
+        self._check_change(change, len(self.splats) - before)
         self.density_change = change
         if change is not None and not len(self.splats):
             raise SceneError(
@@ -377,6 +379,17 @@ class SplatTraining(SceneModel):
                     group |= penalties(self._declared[group["name"]], len(self.splats))
         if update and self.schedule.left(step + 1) < self.optim.averaged:
             self._average.take(self._learned())
+
+    def _check_change(self, change: Any, more: int) -> None:
+        """Raises ValueError where density control does not tell what it did: averages and penalties would go on as before."""
+        rule = f"{type(self.density).__name__}.refine"
+        wanted = "DensityChange(added=..., removed=...), or None where nothing was changed"
+        if not isinstance(change, DensityChange | None):
+            raise ValueError(f"{rule} returned {change!r}: return {wanted}")
+        if change is None and more:
+            raise ValueError(
+                f"{rule} returned None and left {abs(more)} Gaussians {'more' if more > 0 else 'fewer'}: return {wanted}"
+            )
 
     def _learned(self) -> Iterator[tuple[str, nn.Parameter]]:
         """Parameters by name, without those that are given."""

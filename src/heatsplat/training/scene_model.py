@@ -85,6 +85,7 @@ class SceneModel(pl.LightningModule):
             query = _query(frame, ids, moved)
             if values is None:
                 told = self.thermal.features(self.splats, query)
+                self._check_features(told, len(ids))
             else:
                 told = values.index_select(0, ids // self.thermal.per_row)
             return self.composite.encode(told, channels)
@@ -107,6 +108,16 @@ class SceneModel(pl.LightningModule):
             output.meta["opacities"], output.meta["rows_in_view"] = moved.opacities.detach(), moved.in_view
         image = self.composite.decode(output.features, channels)
         return output if image is output.features else replace(output, features=image)
+
+    def _check_features(self, told: Tensor, count: int) -> None:
+        """Raises ValueError where the thermal model does not tell what each Gaussian in view emits."""
+        shape = (count, sum(self.thermal.modality_channels))
+        if not isinstance(told, Tensor) or tuple(told.shape) != shape:
+            got = list(told.shape) if isinstance(told, Tensor) else type(told).__name__
+            raise ValueError(
+                f"what {type(self.thermal).__name__}.features returns must be {list(shape)}, a row for each Gaussian in view "
+                f"(query.rows) and a column for each channel, got {got}"
+            )
 
     def _render_field(self, frame: Frame, channels: int, generator: torch.Generator | None) -> RenderOutput:
         """As ``render``, of a model without Gaussians."""
