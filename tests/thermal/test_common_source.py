@@ -175,6 +175,15 @@ def test_it_can_be_made_double_after_it_has_been_prepared():
     torch.testing.assert_close(wide.float(), narrow, rtol=0, atol=2e-3)
 
 
+def test_a_moment_that_was_shown_without_gradients_can_be_asked_with_them():
+    model = ready()
+    splats = splats_of(model, numbers())
+    with torch.inference_mode():  # as a test renders
+        shown = model.features(splats, Query(None, time_s=123.0))
+    model.features(splats, Query(None, time_s=123.0)).sum().backward()
+    assert float(model.course.grad.abs().max()) > 0 and torch.equal(model.features(splats, Query(time_s=123.0)), shown)
+
+
 def test_a_course_of_another_length_is_resampled_and_none_is_always_on():
     assert CommonSource(moments=5, course=[0.0, 1.0]).course.tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
     assert CommonSource(moments=4).course.tolist() == [1.0] * 4

@@ -122,11 +122,12 @@ class CommonSource(Relaxing):
         if spans not in self._answers:
             if len(self._answers) >= MOMENTS_KEPT:
                 self._answers.clear()
-            rates = self.rates.cpu()
-            faded = torch.exp(-rates * (spans - within))[:, None] if spans > within else 1.0
-            began = max(spans, -1.0 / float(rates.max()))
-            answers = torch.exp(-rates * began), faded * self._table.exact(within)
-            self._answers[spans] = tuple(tensor.to(self.course) for tensor in answers)
+            with torch.inference_mode(False), torch.no_grad():  # kept for those who differentiate, too
+                rates = self.rates.cpu()
+                faded = torch.exp(-rates * (spans - within))[:, None] if spans > within else 1.0
+                began = max(spans, -1.0 / float(rates.max()))
+                answers = torch.exp(-rates * began), faded * self._table.exact(within)
+                self._answers[spans] = tuple(tensor.to(self.course) for tensor in answers)
         decays, answers = self._answers[spans]
         return torch.cat([decays, answers @ self.course])
 
