@@ -149,8 +149,11 @@ def test_gradients_are_those_of_differences():
 def test_what_it_says_of_itself():
     model = ready()
     given = numbers()
-    rise = model.attributes(splats_of(model, given), Query(None))["source_rise_c"]
+    splats = splats_of(model, given)
+    rise = model.attributes(splats, Query(None))["source_rise_c"]
     torch.testing.assert_close(rise, 50.0 * given[:, 3:].sum(1))  # the course is at most 1
+    rise.sum().backward()
+    torch.testing.assert_close(splats["modes"].grad, (50.0 * model.mixing[:, 3:].sum(1)).expand(len(given), -1))
     assert model.effects()["harmonic_source"] == {"source": "common", "moments": 9}
     (course,) = model.courses()
     assert course.times_s[0] == 0.0 and course.times_s[-1] == SPAN_S and course.values == pytest.approx(COURSE)

@@ -208,7 +208,8 @@ class Heat(nn.Module, ABC):
         return ()
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        """Further quantities of the Gaussians in ``query.ids`` that are worth a picture, by name, each [n]."""
+        """Further quantities of the Gaussians in ``query.ids`` that are worth a picture, by name, each [n]; with a gradient to
+        what Gaussians learned, by which their intervals are told (``heatsplat.uncertainty``)."""
         return {}
 
     def quotients(self, told: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -141,9 +141,8 @@ class CommonSource(Relaxing):
         """By how much the source at its strongest would warm what it shines on for ever, in °C, with a range of temperatures."""
         if self.range.bounds is None:
             return {}
-        with torch.no_grad():
-            gains = self.mixing[:, len(self.rates) :].sum(1) * self.course.abs().max()
-            return {"source_rise_c": self.range.bounds.span_k * (query.rows(splats["modes"]) @ gains)}
+        gains = self.mixing[:, len(self.rates) :].sum(1) * self.course.abs().max()
+        return {"source_rise_c": self.range.bounds.span_k * (query.rows(splats["modes"]) @ gains)}
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {
