@@ -397,12 +397,13 @@ class SplatTraining(SceneModel):
         if steps == 0:
             return self._scored(view, view.frame)
         self.results.data["test_cameras_aligned"] = f"each to its image, in {steps} steps"
-        return self._scored(view, replace(view.frame, camera=self.aligned(view, view.frame.camera, steps)))
+        camera = self.aligned(view, view.frame.camera, steps)
+        return self._scored(view, replace(view.frame, camera=camera), camera)
 
-    def _scored(self, view: View, frame: Frame) -> dict[str, Any]:
-        """What is scored of a view, from the camera and at the time of ``frame``."""
+    def _scored(self, view: View, frame: Frame, camera: Camera | None = None) -> dict[str, Any]:
+        """What is scored of a view, as ``predict_all`` tells it of a frame and a camera."""
         start = time.perf_counter()
-        images = self.predict_all(frame)
+        images = self.predict_all(frame, camera)
         if view.clean is None and not self.sensor.parts:
             del images["clean"]  # it is the recorded image, judged against the same target
         if images[self.modality].is_cuda:
