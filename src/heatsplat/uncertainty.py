@@ -66,6 +66,11 @@ def _pixels(view: View, modality: str) -> Tensor:
     return (image if view.mask is None else image[view.mask]).flatten()
 
 
+def _that_tell(views: ViewSet) -> ViewSet:
+    """The views of which pixels count."""
+    return views.subset([i for i, view in enumerate(views) if view.mask is None or bool(view.mask.any())])
+
+
 def _gathered(module: Any, view: View, maps: Tensor) -> Tensor:
     """Σ_p w_ip α_p m_p [N, M] of maps m [H, W, M] over the pixels of a view that count; maps of 1 are weights."""
     with torch.enable_grad():  # what pixels gather from Gaussians, the gradient gives back to them
@@ -180,10 +185,12 @@ class Uncertainty:
             )
         self.prior = float(known.std(correction=0))
         self.evidence = evidence(module, scene.train)
-        self.held_out = scene.val if len(scene.val) else scene.train
-        if not len(scene.val):
+        self.held_out = _that_tell(scene.val)
+        if not len(self.held_out):
+            self.held_out = _that_tell(scene.train)
             log.warning(
-                "scene '%s' holds no images out: intervals are fitted to images that training saw, and are too narrow",
+                "scene '%s' holds no images out of which pixels count: intervals are fitted to images that training saw, and are "
+                "too narrow",
                 scene.name,
             )
         found = self._parts(self.held_out, STRETCHES)
