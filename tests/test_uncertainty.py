@@ -225,7 +225,7 @@ def levels(values, views=5, doubt=None):
         beside=0.0,
         inseparable="",
         features=lambda splats, query: splats["level"][:, None] + module.thermal.beside,
-        attributes=lambda splats, query: {"double": 2 * splats["level"]},
+        attributes=lambda splats, query: {"double": 2 * splats["level"], "of all": torch.ones(len(splats))},
         doubts=lambda: {} if doubt is None else {"beside": partial(off, module, doubt)},
     )
     module.attributes = lambda frame: module.thermal.attributes(module.splats, None)
@@ -243,6 +243,12 @@ def of_least_squares(told):
     each = told.evidence.weight / len(told.module.scene.train)
     tells = each / (0.1**2 + each * told.evidence.misfit)
     return 2 / (tells * len(told.module.scene.train) + 1 / (4 * 0.02)).sqrt()
+
+
+def test_what_no_gaussian_tells_is_not_said_to_be_certain():
+    told = levels([0.2, 0.4])
+    assert "of all" in told.module.attributes(FRAME)
+    assert list(told.of_attributes(FRAME)) == list(told.attribute_deviations(FRAME)) == ["double"]
 
 
 def test_what_is_learned_is_as_certain_as_what_it_does_to_images():

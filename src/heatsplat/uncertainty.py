@@ -233,8 +233,9 @@ class Uncertainty:
         numbers are what views then make of it. Not in it is what else all views have in common, such as a wrong emissivity or
         air temperature, and what an observed surface is that the model's is not.
 
-        Empty for models that tell nothing, and for those of which a Gaussian has more numbers than such a block can hold, or
-        not all the same.
+        What neither a Gaussian's numbers nor a doubt change, such as how much of all heat the air lets pass, has none: it is no
+        more certain than what the whole scene has in common, of which this knows nothing. Empty for models that tell nothing, and
+        for those of which a Gaussian has more numbers than such a block can hold, or not all the same.
         """
         module, count = self.module, len(self.module.splats)
         names = list(module.attributes(frame))
@@ -257,7 +258,7 @@ class Uncertainty:
             block.learn(frames, weights[:, part], repeated, spread)
             for name in names:
                 deviations[name][part] = block.deviation(name, frame)
-        return deviations
+        return {name: found for name, found in deviations.items() if bool((found != 0).any())}
 
     def _weighed_views(self) -> tuple[list[Frame], Tensor, float]:
         """Frames of the training views in the order of time, the information [V, N] float32 that each has of a Gaussian's
