@@ -102,6 +102,23 @@ def test_a_model_with_values_of_each_frame_needs_these(tmp_path):
         load(last, {"split": "block"})
 
 
+def test_a_model_that_knows_frames_by_their_numbers_needs_these(tmp_path):
+    data = write_scene(tmp_path / "data")
+    (data / "test.txt").write_text("frame_00\nframe_08\n")
+    split = ("data.split=list", "data.split_file=test.txt")
+    for method in ("thermal3dgs", "3dgs"):  # of which the first tells images without times by their numbers
+        run(tmp_path / method, *RUN, f"method={method}", *split, f"data.root={data}", "test=false")
+    indexed, plain = (tmp_path / method / "checkpoints" / "last.ckpt" for method in ("thermal3dgs", "3dgs"))
+    assert load(indexed, {"split": "block"}) and load(indexed)
+    told = json.loads((data / "transforms.json").read_text())
+    told["frames"] = told["frames"][1:]  # a test frame is gone
+    (data / "transforms.json").write_text(json.dumps(told))
+    (data / "test.txt").write_text("frame_08\n")
+    assert load(plain)
+    with pytest.raises(SceneError, match="its frames are numbered in another way"):
+        load(indexed)
+
+
 def test_training_does_not_go_on_with_other_images(ckpt, tmp_path):
     for name, scene in {"cameras of 12": {"turn": 0.1}, "training frames? .* more": {"count": COUNT + 3}}.items():
         other = write_scene(tmp_path / name[:4] / "data", **scene)
