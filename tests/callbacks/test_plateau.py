@@ -131,6 +131,16 @@ def test_a_resumed_run_ends_where_the_uninterrupted_one_does():
         assert resumed.density.cap_max == whole.density.cap_max
 
 
+def test_a_run_that_goes_on_for_longer_is_judged_anew():
+    (_, judged), (module, callback) = trained(lambda share: 0.2 if share < 0.25 else 0.1), (module_of(), Plateau())
+    module.schedule = Schedule(2 * STEPS)
+    callback.load_state_dict(judged.state_dict())
+    callback.on_train_start(None, module)
+    callback.on_train_end(None, module)
+    assert module.density.cap_max == 1000 and "early_stop" not in module.results.run
+    assert callback.state_dict() == Plateau().state_dict()
+
+
 def test_errors_after_a_reset_of_opacities_do_not_count():
     class Resetting(DensityControl):
         def settled(self, step):

@@ -134,8 +134,12 @@ class Plateau(pl.Callback):
             module.density.cap_max = min(module.density.cap_max, self._found["gaussians"])
 
     def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        if self._found is not None:  # resumed in the tail
+        if self._found is None:
+            return
+        if module.schedule.end == self._found["steps"]:  # resumed in the tail
             self._hold(module)
+        else:  # a run that goes on for longer than the one that was judged
+            self._found, self._before, self._now = None, {}, {}
 
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self._found is not None:

@@ -451,9 +451,9 @@ class SplatTraining(SceneModel):
         own = checkpoint[CHECKPOINT_KEY]
         if self.schedule.load_state_dict(own["schedule"]):
             self.density.load_times(own.get("density_times", {}))
+            if "average" in own:  # of a run that goes on for longer, these updates are not the last ones
+                self._average.load_state_dict(own["average"], self.device)
         self._waiting = {name: own[name] for name in ("gradients", "unwritten") if name in own}
-        if "average" in own:
-            self._average.load_state_dict(own["average"], self.device)
         state = own["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
 
