@@ -67,6 +67,13 @@ def test_what_is_right_goes_on(ckpt, tmp_path):
     assert load(ckpt, {"root": str(tmp_path / "data")}).scene.train.frames
 
 
+def test_test_images_that_were_trained_on_are_told(ckpt, caplog):
+    load(ckpt, {"downscale": 2})
+    assert "were trained on" not in caplog.text
+    load(ckpt, {"split": "block"})
+    assert "2 of the 2 test images of scene 'data' were trained on (frame_06.png, frame_07.png): " in caplog.text
+
+
 def test_a_run_whose_test_views_were_listed_is_looked_at_with_another_split(ckpt, tmp_path):
     stored = load_checkpoint(ckpt)
     stored["heatsplat"]["config"]["data"] |= {"split": "list", "split_file": "list.txt"}
