@@ -151,6 +151,7 @@ class Heat(nn.Module, ABC):
         needs: metadata it cannot do without, a subset of SceneData.metadata's vocabulary; checked at set-up.
         narrowest_range_k: narrowest range of temperatures in kelvin that it can show; checked at set-up.
         lr, lr_end, paced, held: the ``Rate`` of its own parameters (those that are not per Gaussian).
+        optional: tensors that it does without where a checkpoint has none, as of a weather that told less than that of now.
         inseparable: one clause that says why its Gaussians cannot be merged one by one; empty where they can.
         beyond_record: one clause that says what it assumes of moments outside the training record, for warnings; empty
             where that goes without saying.
@@ -158,6 +159,7 @@ class Heat(nn.Module, ABC):
 
     needs: frozenset[str] = frozenset()
     narrowest_range_k: float = 0.0
+    optional: frozenset[str] = frozenset()
     inseparable: str = ""
     beyond_record: str = "it is evaluated as within the record, which nothing has tested"
     lr: float = 1e-3

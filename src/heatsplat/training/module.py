@@ -438,6 +438,10 @@ class SplatTraining(SceneModel):
     def make_room(self, checkpoint: dict[str, Any]) -> None:
         """Gives every tensor the size that it has in the checkpoint, and takes over what is no tensor."""
         weights = checkpoint["state_dict"]
+        for name in self.thermal.optional.intersection(self.splats.names):
+            if f"splats.raw.{name}" not in weights:
+                self.splats.remove(name)
+                del self._declared[name]
         check_same_method(self, checkpoint)
         stored = {name: tuple(weights[f"splats.raw.{name}"].shape) for name in self.splats.names}
         # What does not learn may have other columns under the weather of today: those of the checkpoint count.
