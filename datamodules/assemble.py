@@ -201,6 +201,12 @@ def _split(
         "test_views": len(test),
         "val_views": f"{len(val)} of the test views, evenly spaced; they draw curves and select nothing",
     }
+    if both := sorted(set(train) & set(test)):
+        notes["split_in_both"] = f"{counted(len(both), 'test frame')} trained on, too: scores flatter the run"
+        log.warning(
+            "data.split=%s: training and test have %s in common (%s), so that scores flatter the run; name each in one list",
+            rule.rule, counted(len(both), "frame"), ", ".join(frames[i].name for i in both[:3]) + ", ..." * (len(both) > 3),
+        )  # fmt: skip
     if left_out := len(frames) - len(set(train) | set(test)):
         notes["split_left_out"] = f"{counted(left_out, 'frame')} in neither list, not used"
     return train, test, val

@@ -141,6 +141,24 @@ def test_intervals_hold_the_truth_and_grow_where_no_camera_looked(tmp_path, monk
     assert told.usual < hidden.usual < hidden.noise * hidden.unit
 
 
+def test_held_out_images_of_which_no_pixel_counts_are_passed_over(tmp_path, caplog):
+    module, _ = run(tmp_path, "method=3dgs", "data.scene=static", "max_steps=20", *BARE)
+    scene, views = module.scene, list(module.scene.val)
+
+    def masked(*which):
+        nothing = torch.zeros(views[0].thermal.shape[:2], dtype=torch.bool)
+        seen = [replace(view, mask=nothing) if i in which else view for i, view in enumerate(views)]
+        return replace(scene, val=ViewSet([view.frame for view in seen], lambda i: seen[i]))
+
+    module.scene = replace(scene, val=scene.val.subset([2]))
+    alone = Uncertainty(module).coverage()
+    module.scene = masked(0, 1)
+    assert len(views) == 3 and Uncertainty(module).coverage() == alone
+    assert "too narrow" not in caplog.text
+    module.scene = masked(0, 1, 2)
+    assert 0.5 < Uncertainty(module).coverage() < 0.9 and "holds no images out of which pixels count" in caplog.text
+
+
 def recorded(noise, error=0.10, count=40_000):
     """Rows of pixels that are off by ``error`` beside a ``noise``, with variances that vary from place to place; the errors."""
     generator = torch.Generator().manual_seed(0)
@@ -207,7 +225,7 @@ def levels(values, views=5, doubt=None):
         beside=0.0,
         inseparable="",
         features=lambda splats, query: splats["level"][:, None] + module.thermal.beside,
-        attributes=lambda splats, query: {"double": 2 * splats["level"]},
+        attributes=lambda splats, query: {"double": 2 * splats["level"], "of all": torch.ones(len(splats))},
         doubts=lambda: {} if doubt is None else {"beside": partial(off, module, doubt)},
     )
     module.attributes = lambda frame: module.thermal.attributes(module.splats, None)
@@ -225,6 +243,12 @@ def of_least_squares(told):
     each = told.evidence.weight / len(told.module.scene.train)
     tells = each / (0.1**2 + each * told.evidence.misfit)
     return 2 / (tells * len(told.module.scene.train) + 1 / (4 * 0.02)).sqrt()
+
+
+def test_what_no_gaussian_tells_is_not_said_to_be_certain():
+    told = levels([0.2, 0.4])
+    assert "of all" in told.module.attributes(FRAME)
+    assert list(told.of_attributes(FRAME)) == list(told.attribute_deviations(FRAME)) == ["double"]
 
 
 def test_what_is_learned_is_as_certain_as_what_it_does_to_images():

@@ -83,6 +83,10 @@ class Splats(nn.Module):
         """Opacity in (0, 1), [M, N]."""
         return sigmoid(self.raw["opacity_logits"]).T
 
+    def remove(self, name: str) -> None:
+        """Takes a tensor away."""
+        self.raw.pop(name)
+
     def places(self, name: str) -> Tensor | None:
         """Row of a sparse tensor that belongs to each Gaussian, [N] int64, -1 for none; None where each has its own."""
         return self._places._buffers.get(name)

@@ -66,6 +66,11 @@ def _pixels(view: View, modality: str) -> Tensor:
     return (image if view.mask is None else image[view.mask]).flatten()
 
 
+def _that_tell(views: ViewSet) -> ViewSet:
+    """The views of which pixels count."""
+    return views.subset([i for i, view in enumerate(views) if view.mask is None or bool(view.mask.any())])
+
+
 def _gathered(module: Any, view: View, maps: Tensor) -> Tensor:
     """Σ_p w_ip α_p m_p [N, M] of maps m [H, W, M] over the pixels of a view that count; maps of 1 are weights."""
     with torch.enable_grad():  # what pixels gather from Gaussians, the gradient gives back to them
@@ -180,10 +185,12 @@ class Uncertainty:
             )
         self.prior = float(known.std(correction=0))
         self.evidence = evidence(module, scene.train)
-        self.held_out = scene.val if len(scene.val) else scene.train
-        if not len(scene.val):
+        self.held_out = _that_tell(scene.val)
+        if not len(self.held_out):
+            self.held_out = _that_tell(scene.train)
             log.warning(
-                "scene '%s' holds no images out: intervals are fitted to images that training saw, and are too narrow",
+                "scene '%s' holds no images out of which pixels count: intervals are fitted to images that training saw, and are "
+                "too narrow",
                 scene.name,
             )
         found = self._parts(self.held_out, STRETCHES)
@@ -226,8 +233,9 @@ class Uncertainty:
         numbers are what views then make of it. Not in it is what else all views have in common, such as a wrong emissivity or
         air temperature, and what an observed surface is that the model's is not.
 
-        Empty for models that tell nothing, and for those of which a Gaussian has more numbers than such a block can hold, or
-        not all the same.
+        What neither a Gaussian's numbers nor a doubt change, such as how much of all heat the air lets pass, has none: it is no
+        more certain than what the whole scene has in common, of which this knows nothing. Empty for models that tell nothing, and
+        for those of which a Gaussian has more numbers than such a block can hold, or not all the same.
         """
         module, count = self.module, len(self.module.splats)
         names = list(module.attributes(frame))
@@ -250,7 +258,7 @@ class Uncertainty:
             block.learn(frames, weights[:, part], repeated, spread)
             for name in names:
                 deviations[name][part] = block.deviation(name, frame)
-        return deviations
+        return {name: found for name, found in deviations.items() if bool((found != 0).any())}
 
     def _weighed_views(self) -> tuple[list[Frame], Tensor, float]:
         """Frames of the training views in the order of time, the information [V, N] float32 that each has of a Gaussian's

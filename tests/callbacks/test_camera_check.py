@@ -22,6 +22,8 @@ def seen_from(x: float) -> Camera:
 
 
 class View:
+    mask = None
+
     def __init__(self, number: int) -> None:
         self.frame = Frame(f"{number}.png", number, seen_from(0.01 * number))
 
@@ -65,6 +67,13 @@ def test_cameras_that_are_off_are_told_with_the_remedy(caplog):
     assert found == {"images": 4, "moved_px": pytest.approx(0.4, rel=1e-6), "error_falls": pytest.approx(0.4)}
     assert len(set(module.looked)) == 4 and "moved by 0.4 pixels" in caplog.text and "40 %" in caplog.text
     assert "cameras=refined" in caplog.text
+
+
+def test_images_of_which_no_pixel_counts_say_nothing_of_cameras():
+    module = Module(beside=0.4, left=0.6)
+    for view in module.scene.train[:-1]:
+        view.mask = torch.zeros(30, 40, dtype=torch.bool)
+    assert checked(module, views=4)["images"] == 1 and module.looked == [19]
 
 
 @pytest.mark.parametrize(("left", "learns"), [(1 - OFF + 0.01, False), (1.02, False), (0.5, True)])

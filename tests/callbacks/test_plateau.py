@@ -1,5 +1,6 @@
 """Runs that gain no more end early, in a short tail; those that do are left alone."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -8,7 +9,7 @@ from fake_run import wall
 
 from heatsplat.callbacks.budget import BudgetClock
 from heatsplat.callbacks.plateau import Plateau, squared_error
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, ViewSet
 from heatsplat.density.base import DensityControl
 from heatsplat.io.results import RunResults
 from heatsplat.training.overlap import Overlap, ShortLists
@@ -72,6 +73,17 @@ def test_a_run_that_gains_no_more_ends_after_a_short_tail():
     assert found["residual"] == pytest.approx(0.1, rel=0.01)
 
 
+def test_an_image_of_which_no_pixel_counts_does_not_keep_a_run_going(monkeypatch):
+    scene = wall()
+    views = list(scene.train)
+    views[0] = replace(views[0], mask=torch.zeros(views[0].thermal.shape[:2], dtype=torch.bool))
+    masked = replace(scene, train=ViewSet([view.frame for view in views], lambda i: views[i]))
+    whole, _ = trained(lambda share: 0.2 if share < 0.25 else 0.1)
+    monkeypatch.setitem(module_of.__globals__, "wall", lambda: masked)
+    module, _ = trained(lambda share: 0.2 if share < 0.25 else 0.1)
+    assert module.schedule.end == whole.schedule.end == 0.6 * STEPS
+
+
 def test_a_run_that_goes_on_gaining_is_left_alone():
     module, _ = trained(lambda share: 0.1 * (1 - 0.2 * share))
     assert module.schedule.end == STEPS
@@ -117,6 +129,16 @@ def test_a_resumed_run_ends_where_the_uninterrupted_one_does():
         resumed, _ = trained(lambda share: 0.2 if share < 0.25 else 0.1, stopped_at)
         assert resumed.results.run["early_stop"] == whole.results.run["early_stop"]
         assert resumed.density.cap_max == whole.density.cap_max
+
+
+def test_a_run_that_goes_on_for_longer_is_judged_anew():
+    (_, judged), (module, callback) = trained(lambda share: 0.2 if share < 0.25 else 0.1), (module_of(), Plateau())
+    module.schedule = Schedule(2 * STEPS)
+    callback.load_state_dict(judged.state_dict())
+    callback.on_train_start(None, module)
+    callback.on_train_end(None, module)
+    assert module.density.cap_max == 1000 and "early_stop" not in module.results.run
+    assert callback.state_dict() == Plateau().state_dict()
 
 
 def test_errors_after_a_reset_of_opacities_do_not_count():

@@ -1,6 +1,7 @@
 import json
 
 import pytest
+from layouts import names, write_colmap
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
@@ -107,3 +108,15 @@ def test_what_is_no_split_is_refused_before_anything_is_read():
         SceneError, match="data.split_file=a.txt has no effect with data.split=block: add data.split=list"
     ):
         SplitRule("block", file="a.txt")
+
+
+def test_frames_in_both_lists_are_told(tmp_path, caplog):
+    files = names(3)
+    write_colmap(tmp_path, files)
+    (tmp_path / "split.json").write_text(json.dumps({"train": files[:2], "test": files[1:]}))
+    scene = Colmap(root=str(tmp_path), split="list", split_file="split.json").scene
+    assert (len(scene.train), len(scene.test), len(scene.frames)) == (2, 2, 3)
+    assert (
+        f"data.split=list: training and test have 1 frame in common ({files[1]}), so that scores flatter" in caplog.text
+    )
+    assert scene.notes["split_in_both"] == "1 test frame trained on, too: scores flatter the run"

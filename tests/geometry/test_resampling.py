@@ -74,6 +74,17 @@ def test_gradients_are_those_of_the_matrix():
     assert torch.autograd.gradcheck(lambda x: resampled(x, 4, 6, "bicubic"), (image,))
 
 
+def test_weights_that_were_made_without_gradients_pass_them():
+    weights.cache_clear()
+    image = noise(9, 12).double()
+    with torch.inference_mode():  # as a test renders
+        shown = resampled(image, 5, 7, "area")
+    image.requires_grad_()
+    again = resampled(image, 5, 7, "area")
+    again.sum().backward()
+    assert torch.equal(again, shown) and float(image.grad.min()) > 0
+
+
 def test_what_is_masked_never_reaches_a_valid_pixel():
     mask = torch.ones(32, 40, dtype=torch.bool)
     mask[14, 21] = False

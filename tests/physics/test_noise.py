@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from heatsplat.contracts import Camera, Frame, View, ViewSet
-from heatsplat.physics.noise import noise_of, noise_of_repeats, noise_of_views, quantum_of, robust_spread
+from heatsplat.physics.noise import MIN_NOISE, noise_of, noise_of_repeats, noise_of_views, quantum_of, robust_spread
 
 
 def scene_images(frames: int, noise: float, seed: int = 0) -> torch.Tensor:
@@ -46,6 +46,20 @@ def test_noise_of_views_of_several_sizes_leaves_masked_pixels_out():
         return View(frames[i], image[..., None], mask=mask)
 
     assert noise_of_views(ViewSet(frames, view), "thermal") == pytest.approx(0.01, rel=0.15)
+
+
+def test_views_that_are_masked_whole_do_not_lower_the_noise():
+    camera = Camera(torch.eye(4), torch.eye(3), 80, 60)
+    frames = [Frame(str(i), i, camera) for i in range(5)]
+
+    def told(seen):
+        def view(i: int) -> View:
+            mask = torch.full((60, 80), i in seen)
+            return View(frames[i], scene_images(1, 0.01, seed=i)[0][..., None], mask=mask)
+
+        return noise_of_views(ViewSet(frames, view), "thermal")
+
+    assert told([3, 4]) == pytest.approx(0.01, rel=0.15) and told([]) == MIN_NOISE
 
 
 def test_a_robust_spread_is_the_standard_deviation_without_what_lies_far_out_and_what_is_unknown():

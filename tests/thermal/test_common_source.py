@@ -149,8 +149,11 @@ def test_gradients_are_those_of_differences():
 def test_what_it_says_of_itself():
     model = ready()
     given = numbers()
-    rise = model.attributes(splats_of(model, given), Query(None))["source_rise_c"]
+    splats = splats_of(model, given)
+    rise = model.attributes(splats, Query(None))["source_rise_c"]
     torch.testing.assert_close(rise, 50.0 * given[:, 3:].sum(1))  # the course is at most 1
+    rise.sum().backward()
+    torch.testing.assert_close(splats["modes"].grad, (50.0 * model.mixing[:, 3:].sum(1)).expand(len(given), -1))
     assert model.effects()["harmonic_source"] == {"source": "common", "moments": 9}
     (course,) = model.courses()
     assert course.times_s[0] == 0.0 and course.times_s[-1] == SPAN_S and course.values == pytest.approx(COURSE)
@@ -173,6 +176,15 @@ def test_it_can_be_made_double_after_it_has_been_prepared():
     wide = model.temperature(splats_of(model, given), 123.0)
     assert wide.dtype == torch.float64
     torch.testing.assert_close(wide.float(), narrow, rtol=0, atol=2e-3)
+
+
+def test_a_moment_that_was_shown_without_gradients_can_be_asked_with_them():
+    model = ready()
+    splats = splats_of(model, numbers())
+    with torch.inference_mode():  # as a test renders
+        shown = model.features(splats, Query(None, time_s=123.0))
+    model.features(splats, Query(None, time_s=123.0)).sum().backward()
+    assert float(model.course.grad.abs().max()) > 0 and torch.equal(model.features(splats, Query(time_s=123.0)), shown)
 
 
 def test_a_course_of_another_length_is_resampled_and_none_is_always_on():

@@ -422,6 +422,15 @@ def test_conduction_solves_its_implicit_step():
     assert got.std() < alone.std() and got.min() >= alone.min() - 1e-6 and got.max() <= alone.max() + 1e-6
 
 
+def test_a_graph_that_was_drawn_without_gradients_conducts_them():
+    model, splats = conducting()
+    with torch.inference_mode():  # as a test renders
+        shown = model.features(splats, Query(time_s=150.0))
+    again = model.features(splats, Query(time_s=150.0))
+    again.sum().backward()
+    assert torch.equal(again, shown) and float(splats["initial_state"].grad.abs().min()) > 0
+
+
 def test_gradients_of_conduction_are_those_of_the_dense_system():
     model, splats = conducting()
     weights = torch.randn(40, 1, generator=torch.Generator().manual_seed(4))

@@ -142,6 +142,13 @@ def test_heat_refines_normals(lr_tilt):
     assert math.degrees(math.acos(min(1.0, float(found @ torch.tensor(truth))))) < 1.0
 
 
+def test_what_it_tells_changes_with_the_tilt():
+    part = ready()
+    splats = splats_of(part, [(0.0, 0.0, 1.0)])
+    part.attributes(splats, Query(camera=at_angle(60.0)))["relative_emissivity"].sum().backward()
+    assert float(splats["normal_tilt"].grad[0, 0]) > 0  # towards the camera
+
+
 def test_surroundings_of_unknown_temperature_are_learned():
     part = DirectionalEmissivity()
     part.prepare(replace(scene(), ambient_c=None))

@@ -99,6 +99,14 @@ def test_no_head_leaves_its_bounds_and_no_gradient_is_lost_whatever_the_network_
     assert splats["feature"].grad.isfinite().all()
 
 
+@pytest.mark.parametrize("attributes", ["inferred", "constant"])
+def test_materials_change_with_the_feature_of_a_gaussian(attributes):
+    model, splats = make(disturb=0.3, attributes=attributes)
+    for name, values in model.attributes(splats, query()).items():
+        (slopes,) = torch.autograd.grad(values.sum(), [splats["feature"]], retain_graph=True)
+        assert (slopes != 0).any(1).all(), name
+
+
 def test_kelvin_and_image_values_are_the_same_temperature():
     model, splats = make(disturb=0.5)
     image = model.features(splats, query())[:, 0]

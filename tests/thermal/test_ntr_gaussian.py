@@ -7,7 +7,7 @@ import pytest
 import torch
 from weathered import CAMERA, HOUR_S, make_scene
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, ThermalRange
 from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import Query, Seeds
@@ -56,6 +56,17 @@ def test_a_steady_balance_integrates_exactly():
         expected = low + 0.7 * span - window * flux / (STORAGE * (math.log(2.0) + 0.05))
         found = model.range.kelvin(model._units(splats, None, 2 * HOUR_S))
         assert torch.allclose(found, torch.full_like(found, expected), atol=2e-3)
+
+
+def test_a_checkpoint_shows_the_same_where_the_data_are_divided_in_another_way():
+    trained, splats, scene = make(window_s=HOUR_S)
+    halved = replace(scene, thermal_range=ThermalRange(20.0, 22.0))
+    trained.prepare(halved)
+    later, _, _ = make(window_s=HOUR_S)
+    few = [i for i, time_s in enumerate(scene.train.times_s) if time_s <= 0.5 * HOUR_S]
+    later.prepare(replace(halved, train=scene.train.subset(few)))
+    later.load_state_dict(trained.state_dict())
+    assert torch.equal(later.temperature(splats, HOUR_S), trained.temperature(splats, HOUR_S))
 
 
 def test_more_nodes_converge_at_second_order():

@@ -44,6 +44,7 @@ class Probe(ThermalModel):
 
     needs = frozenset({"time", "ambient"})
     narrowest_range_k = 0.25
+    optional = frozenset({"probed"})
     inseparable = "it is probed as a whole"
     beyond_record = "it probes on"
 
@@ -180,6 +181,7 @@ def test_no_hook_of_a_model_is_left_out():
         "shared_opacity",
         "needs",
         "narrowest_range_k",
+        "optional",
         "inseparable",
         "stays_here",
     }
@@ -192,7 +194,7 @@ def test_no_hook_of_a_model_is_left_out():
 
 def test_what_the_model_inside_answers_comes_out(wrapped):
     model, probe, splats = wrapped.model, wrapped.probe, wrapped.splats
-    assert model.needs >= probe.needs and model.narrowest_range_k == 0.25
+    assert model.needs >= probe.needs and model.narrowest_range_k == 0.25 and model.optional == probe.optional
     clauses = [type(one).inseparable for one in model.modules() if isinstance(one, Wrapper)]  # from the outside in
     assert model.inseparable == next(filter(None, [*clauses, probe.inseparable]))
     assert model.geometry(splats, QUERY) is MOVED

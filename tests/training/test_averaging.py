@@ -70,6 +70,21 @@ def test_a_run_ends_with_the_mean_of_its_last_updates(method, tmp_path, monkeypa
     assert moved > 1e-4  # it is not the last update
 
 
+def test_a_run_that_goes_on_for_longer_averages_its_own_last_updates(tmp_path):
+    settings = (
+        *TAIL,
+        "method=3dgs",
+        "density=fixed",
+        "optim.accumulate=1",
+        "callbacks.checkpoint.every_n_train_steps=20",
+    )
+    run(tmp_path / "short", *settings)
+    ended = tmp_path / "short" / "checkpoints" / "step_000040.ckpt"  # before the mean took the place of the last update
+    assert torch.load(ended, weights_only=True)["heatsplat"]["average"]["count"] == 10
+    module, _ = run(tmp_path / "long", *settings, "max_steps=60", f"ckpt={ended}")
+    assert module.results.run["averaged_updates"] == 15
+
+
 def test_none_is_kept_where_it_is_off(tmp_path):
     module, _ = run(tmp_path / "off", *TAIL, "method=3dgs", "optim.averaged=0")
     assert "averaged_updates" not in module.results.run

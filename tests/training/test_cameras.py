@@ -224,6 +224,17 @@ def test_a_run_that_was_stopped_goes_on_with_its_cameras(tmp_path):
     assert torch.equal(trained.render(frame).features, seen)
 
 
+def test_a_camera_that_was_aligned_is_not_moved_again_where_its_image_was_trained_on_too(tmp_path):
+    module, _ = run(tmp_path, *BARE, "method=3dgs", "max_steps=20", "cameras=refined", "cameras.align_steps=3")
+    view = module.scene.train[0]  # as of a list of names that holds it for training and for the test
+    with torch.no_grad():
+        module.cameras.moves[0] = 3.0
+    with torch.inference_mode():
+        camera = module.aligned(view, view.frame.camera, 3)
+        seen = module.render(view.frame, camera=camera).features.clamp(0, 1)
+        assert torch.equal(module.test_step(view, 0)["prediction"], seen)
+
+
 def test_only_pixels_that_count_align_a_camera(tmp_path):
     settings = (*BARE, "method=3dgs", "data.scene=static", "data.only=crate", "max_steps=20", "cameras=refined")
     module, _ = run(tmp_path, *settings, "cameras.align_steps=3", "test=true")

@@ -4,9 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from running import BARE, run
 
 from heatsplat.contracts import ThermalRange
 from heatsplat.datamodules.synthetic import Synthetic
+from heatsplat.runs.run import load
+from heatsplat.thermal.composed import Composed
+from heatsplat.thermal.energy_balance import EnergyBalance
 from heatsplat.training.scales import on_scales, scales_of
 
 PARTS = ("train", "val", "test")
@@ -85,3 +89,23 @@ def test_a_static_scene_has_no_clock():
         },
     )
     assert scales_of(timeless)["first"] is None and on_scales(timeless, scales_of(scene)) is timeless
+
+
+def test_a_run_without_wind_is_looked_at_under_a_record_that_has_gained_it(tmp_path, monkeypatch):
+    film = Synthetic.load
+
+    def still(self):
+        scene = film(self)
+        return replace(scene, weather=replace(scene.weather, wind_m_s=None))
+
+    settings = (*BARE, "method=energy_balance", "max_steps=3")
+    with monkeypatch.context() as filming:
+        filming.setattr(Synthetic, "load", still)
+        module, trainer = run(tmp_path, *settings)
+        trainer.save_checkpoint(tmp_path / "still.ckpt")
+    trained = load(tmp_path / "still.ckpt")  # with the record as it is now
+    frame = module.scene.test.frames[0]
+    assert trained.scene.weather.wind_m_s is not None and "raw_wind" not in trained.module.splats
+    assert torch.equal(trained.module.predict(frame), module.predict(frame))
+    assert "none in training" in trained.module.thermal.effects()["convection"]["left_out"]
+    assert Composed(EnergyBalance(clip="none")).optional == {"raw_wind"}

@@ -67,6 +67,13 @@ def test_what_is_right_goes_on(ckpt, tmp_path):
     assert load(ckpt, {"root": str(tmp_path / "data")}).scene.train.frames
 
 
+def test_test_images_that_were_trained_on_are_told(ckpt, caplog):
+    load(ckpt, {"downscale": 2})
+    assert "were trained on" not in caplog.text
+    load(ckpt, {"split": "block"})
+    assert "2 of the 2 test images of scene 'data' were trained on (frame_06.png, frame_07.png): " in caplog.text
+
+
 def test_a_run_whose_test_views_were_listed_is_looked_at_with_another_split(ckpt, tmp_path):
     stored = load_checkpoint(ckpt)
     stored["heatsplat"]["config"]["data"] |= {"split": "list", "split_file": "list.txt"}
@@ -100,6 +107,23 @@ def test_a_model_with_values_of_each_frame_needs_these(tmp_path):
     assert load(last)
     with pytest.raises(SceneError, match="training frame.*more.*data.split"):
         load(last, {"split": "block"})
+
+
+def test_a_model_that_knows_frames_by_their_numbers_needs_these(tmp_path):
+    data = write_scene(tmp_path / "data")
+    (data / "test.txt").write_text("frame_00\nframe_08\n")
+    split = ("data.split=list", "data.split_file=test.txt")
+    for method in ("thermal3dgs", "3dgs"):  # of which the first tells images without times by their numbers
+        run(tmp_path / method, *RUN, f"method={method}", *split, f"data.root={data}", "test=false")
+    indexed, plain = (tmp_path / method / "checkpoints" / "last.ckpt" for method in ("thermal3dgs", "3dgs"))
+    assert load(indexed, {"split": "block"}) and load(indexed)
+    told = json.loads((data / "transforms.json").read_text())
+    told["frames"] = told["frames"][1:]  # a test frame is gone
+    (data / "transforms.json").write_text(json.dumps(told))
+    (data / "test.txt").write_text("frame_08\n")
+    assert load(plain)
+    with pytest.raises(SceneError, match="its frames are numbered in another way"):
+        load(indexed)
 
 
 def test_training_does_not_go_on_with_other_images(ckpt, tmp_path):

@@ -40,6 +40,8 @@ class CameraCheck(pl.Callback):
         falls, moved = [], []
         for number in evenly_spread(len(module.scene.train), self.views):
             view = module.scene.train[number].to(module.device, module.dtype)
+            if view.mask is not None and not bool(view.mask.any()):  # it fits from anywhere
+                continue
             with torch.no_grad():
                 given = module.cameras.of(view.frame)
             found = module.aligned(view, given, self.steps)

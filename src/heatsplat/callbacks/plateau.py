@@ -72,7 +72,8 @@ class Plateau(pl.Callback):
             return
         view, schedule, step = batch, module.schedule, trainer.global_step
         prediction, image = outputs["prediction"], view.image(module.modality)
-        if len(prediction) >= len(image):  # a coarse start tells nothing of full size
+        shown = view.mask is None or bool(view.mask.any())
+        if shown and len(prediction) >= len(image):  # a coarse start tells nothing of full size
             total, visits = self._now.get(view.frame.frame_id, (0.0, 0))
             error = squared_error(prediction, image, view.mask)
             self._now[view.frame.frame_id] = (total + error, visits + 1)
@@ -133,8 +134,12 @@ class Plateau(pl.Callback):
             module.density.cap_max = min(module.density.cap_max, self._found["gaussians"])
 
     def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        if self._found is not None:  # resumed in the tail
+        if self._found is None:
+            return
+        if module.schedule.end == self._found["steps"]:  # resumed in the tail
             self._hold(module)
+        else:  # a run that goes on for longer than the one that was judged
+            self._found, self._before, self._now = None, {}, {}
 
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self._found is not None:

@@ -88,6 +88,7 @@ def valid_after(mask: Tensor, height: int, width: int, kernel: str = "bicubic") 
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)  # kept for images with a gradient, too
 def weights(count: int, new_count: int, kernel: str) -> Tensor:
     """The matrix [new_count, count] float64 that resamples a line of pixels; every row sums to one."""
     if kernel not in KERNELS:

@@ -24,9 +24,13 @@ _UNIFORM = 1.0 / math.sqrt(12.0)
 def noise_of_views(views: ViewSet, modality: str) -> float:
     """Standard deviation of the noise of a pixel in the images of a modality, in image units, from a few of the views.
 
-    The median over these views of ``noise_of`` their first channel; quantisation counts as in the first of them.
+    The median over these views of ``noise_of`` their first channel; quantisation counts as in the first of them. Views of
+    which no pixel counts tell nothing; of such alone it is ``MIN_NOISE``.
     """
     few = [views[i] for i in evenly_spread(len(views), _NOISY_VIEWS)]
+    few = [view for view in few if view.mask is None or bool(view.mask.any())]
+    if not few:
+        return MIN_NOISE
     images = [view.image(modality)[None, ..., 0].double() for view in few]
     masks = [None if view.mask is None else view.mask[None] for view in few]
     step = quantum_of(images[0] if masks[0] is None else images[0][masks[0]])

@@ -295,8 +295,10 @@ def load(
     if weather is not None:
         scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
     with _naming(checkpoint, changed):
-        per_frame = any(name.endswith("frame_ids") for name in loaded.get("state_dict", ()))
-        scene_data.scene = on_scales(scene_data.scene, loaded[CHECKPOINT_KEY].get("scales", {}), exactly=per_frame)
+        state, scales = loaded.get("state_dict", {}), loaded[CHECKPOINT_KEY].get("scales", {})
+        per_frame = any(name.endswith("frame_ids") for name in state)
+        numbered = any(name.endswith("by_index") and bool(value) for name, value in state.items())
+        scene_data.scene = on_scales(scene_data.scene, scales, exactly=per_frame, numbered=numbered)
         restore(module, scene_data, loaded)
         if module.renderer.backend in ("cpu", "gsplat"):  # what the machine had on which it was trained
             module.renderer.backend = "auto"

@@ -152,6 +152,7 @@ class Heat(nn.Module, ABC):
         needs: metadata it cannot do without, a subset of SceneData.metadata's vocabulary; checked at set-up.
         narrowest_range_k: narrowest range of temperatures in kelvin that it can show; checked at set-up.
         lr, lr_end, paced, held: the ``Rate`` of its own parameters (those that are not per Gaussian).
+        optional: tensors that it does without where a checkpoint has none, as of a weather that told less than that of now.
         inseparable: one clause that says why its Gaussians cannot be merged one by one; empty where they can.
         beyond_record: one clause that says what it assumes of moments outside the training record, for warnings; empty
             where that goes without saying.
@@ -159,6 +160,7 @@ class Heat(nn.Module, ABC):
 
     needs: frozenset[str] = frozenset()
     narrowest_range_k: float = 0.0
+    optional: frozenset[str] = frozenset()
     inseparable: str = ""
     beyond_record: str = "it is evaluated as within the record, which nothing has tested"
     lr: float = 1e-3
@@ -211,7 +213,8 @@ class Heat(nn.Module, ABC):
         return ()
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        """Further quantities of the Gaussians in ``query.ids`` that are worth a picture, by name, each [n]."""
+        """Further quantities of the Gaussians in ``query.ids`` that are worth a picture, by name, each [n]; with a gradient to
+        what Gaussians learned, by which their intervals are told (``heatsplat.uncertainty``)."""
         return {}
 
     def quotients(self, told: Mapping[str, Tensor]) -> dict[str, Tensor]:

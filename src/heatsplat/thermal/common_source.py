@@ -122,11 +122,12 @@ class CommonSource(Relaxing):
         if spans not in self._answers:
             if len(self._answers) >= MOMENTS_KEPT:
                 self._answers.clear()
-            rates = self.rates.cpu()
-            faded = torch.exp(-rates * (spans - within))[:, None] if spans > within else 1.0
-            began = max(spans, -1.0 / float(rates.max()))
-            answers = torch.exp(-rates * began), faded * self._table.exact(within)
-            self._answers[spans] = tuple(tensor.to(self.course) for tensor in answers)
+            with torch.inference_mode(False), torch.no_grad():  # kept for those who differentiate, too
+                rates = self.rates.cpu()
+                faded = torch.exp(-rates * (spans - within))[:, None] if spans > within else 1.0
+                began = max(spans, -1.0 / float(rates.max()))
+                answers = torch.exp(-rates * began), faded * self._table.exact(within)
+                self._answers[spans] = tuple(tensor.to(self.course) for tensor in answers)
         decays, answers = self._answers[spans]
         return torch.cat([decays, answers @ self.course])
 
@@ -140,9 +141,8 @@ class CommonSource(Relaxing):
         """By how much the source at its strongest would warm what it shines on for ever, in °C, with a range of temperatures."""
         if self.range.bounds is None:
             return {}
-        with torch.no_grad():
-            gains = self.mixing[:, len(self.rates) :].sum(1) * self.course.abs().max()
-            return {"source_rise_c": self.range.bounds.span_k * (query.rows(splats["modes"]) @ gains)}
+        gains = self.mixing[:, len(self.rates) :].sum(1) * self.course.abs().max()
+        return {"source_rise_c": self.range.bounds.span_k * (query.rows(splats["modes"]) @ gains)}
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {

@@ -98,6 +98,8 @@ class Conducting(Wrapper):
         self._join(splats)
         return _ImplicitStep.apply(values, spans * self.log_flow.clamp(*LOG_FLOWS).exp(), self._laplacian[1])
 
+    @torch.inference_mode(False)  # a graph that is drawn for a picture serves those who differentiate, too
+    @torch.no_grad()
     def _join(self, splats: Splats) -> None:
         """Draws the graph of nearest neighbours where there is none, or it is out of date."""
         count = len(splats)

@@ -81,8 +81,7 @@ class DirectionalEmissivity(HeatPart):
         return everywhere(sigmoid(self.falloff_logit), slant) * slant
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
-        with torch.no_grad():
-            return {} if query.camera is None else {"relative_emissivity": 1.0 - self.mirrored(splats, query)[:, 0]}
+        return {} if query.camera is None else {"relative_emissivity": 1.0 - self.mirrored(splats, query)[:, 0]}
 
     def effects(self) -> dict[str, dict[str, Any]]:
         return {"directional_emissivity": {"falloff": torch.sigmoid(self.falloff_logit).item(), "power": self.power}}

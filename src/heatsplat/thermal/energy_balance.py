@@ -129,6 +129,7 @@ class EnergyBalance(ThermalModel):
 
     needs = frozenset({"time", "weather", "thermal_range"})
     narrowest_range_k = KELVIN_RANGE
+    optional = frozenset({"raw_wind"})
     beyond_record = "the recorded weather drives the balance of heat on, and without weather there is no answer"
 
     def __init__(

@@ -377,9 +377,8 @@ class EnergyNetwork(ThermalModel):
         """Emissivity, absorptivity, convection and capacity at the time of the query; nothing in the first stage."""
         if not self._network_emits:
             return {}
-        with torch.no_grad():
-            base = self._base(splats, query.ids)
-            return self._body(splats, query.ids, base, self.network(base, self._moment(query.time_s)))
+        base = self._base(splats, query.ids)
+        return self._body(splats, query.ids, base, self.network(base, self._moment(query.time_s)))
 
     def prior(self, splats: Splats) -> dict[str, Tensor]:
         """Attributes of the classes, each [N]; NaN where there is no class. Empty for models that use no labels."""

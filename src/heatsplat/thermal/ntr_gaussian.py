@@ -138,7 +138,6 @@ class NtrGaussian(ThermalModel):
         self.register_buffer("slow_octaves", torch.tensor(time_frequencies))  # those of time that the networks see
         self.register_buffer("ambient", torch.full((), 0.5))
         self.register_buffer("emits", torch.tensor(first_steps == 0))
-        self._storage = STORAGE
         self._terms: dict[str, Tensor] = {}
 
     # What the contract asks -----------------------------------------------------------------------------
@@ -152,9 +151,6 @@ class NtrGaussian(ThermalModel):
         self.slow_octaves.fill_(slow_octaves(self.time_frequencies, frames, self.frames_per_cycle, slowest))
         bounds = scene.thermal_range
         self.ambient.fill_(0.5 if scene.ambient_c is None else bounds.to_unit(scene.ambient_c))
-        # A scene that hardly cools stores much heat. Otherwise the integral starts at many ranges, where it never learns.
-        sent = 0.5 * STEFAN_BOLTZMANN * self.range.lowest_k**4 * min(self.clock.span_s, self.window_s)
-        self._storage = max(STORAGE, sent / (FIRST_COOLING * bounds.span_k))
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         draw_uniform((module for module in self.modules() if isinstance(module, nn.Linear)), seeds.generator)
@@ -199,6 +195,13 @@ class NtrGaussian(ThermalModel):
         return per_view + self.nodes * per_node
 
     # The integral ---------------------------------------------------------------------------------------
+
+    @property
+    def _storage(self) -> float:
+        """Unit of the heat capacity in J/m²/K, of the record and range that it was trained on."""
+        # A scene that hardly cools stores much heat. Otherwise the integral starts at many ranges, where it never learns.
+        sent = 0.5 * STEFAN_BOLTZMANN * self.range.lowest_k**4 * min(self.clock.span_s, self.window_s)
+        return max(STORAGE, sent / (FIRST_COOLING * self.range.bounds.span_k))
 
     def _units(self, splats: Splats, ids: Tensor | None, time_s: float) -> Tensor:
         """Temperatures [n] in image units at ``time_s``, or at the moment of the record that is nearest if hours do not count."""

@@ -187,7 +187,8 @@ def _wind(weather: Weather, options: BalanceOptions, mean_wind: float) -> Contri
         recorded = f"recorded, {mean_wind:.3g} m/s in the mean"
         return Contribution({"wind_anomaly": weather.wind_m_s / mean_wind - 1}, {"convection": {"wind": recorded}})
     if options.convection is None:
-        return Contribution(effects={"convection": {"left_out": "wind, which the weather lacks"}})
+        lacks = "which the weather lacks" if weather.wind_m_s is None else "of which there was none in training"
+        return Contribution(effects={"convection": {"left_out": f"wind, {lacks}"}})
     if weather.wind_m_s is None:
         raise SceneError(f"exchange={options.exchange} needs wind_m_s, which the weather does not have")
     still = torch.zeros_like(weather.wind_m_s)

@@ -48,6 +48,7 @@ class Wrapper(ThermalModel):
                     "every view, or there are none: choose another model to put into it, such as static"
                 )
         self.needs = frozenset(needs).union(*(member.needs for member in every))
+        self.optional = frozenset().union(*(member.optional for member in every))
         self.narrowest_range_k = max(self.narrowest_range_k, *(member.narrowest_range_k for member in every))
         self.inseparable = self.inseparable or next(filter(None, (member.inseparable for member in every)), "")
         self.stays_here = next(filter(None, (model.stays_here for model in models)), "")

@@ -410,12 +410,13 @@ class SplatTraining(SceneModel):
         if steps == 0:
             return self._scored(view, view.frame)
         self.results.data["test_cameras_aligned"] = f"each to its image, in {steps} steps"
-        return self._scored(view, replace(view.frame, camera=self.aligned(view, view.frame.camera, steps)))
+        camera = self.aligned(view, view.frame.camera, steps)
+        return self._scored(view, replace(view.frame, camera=camera), camera)
 
-    def _scored(self, view: View, frame: Frame) -> dict[str, Any]:
-        """What is scored of a view, from the camera and at the time of ``frame``."""
+    def _scored(self, view: View, frame: Frame, camera: Camera | None = None) -> dict[str, Any]:
+        """What is scored of a view, as ``predict_all`` tells it of a frame and a camera."""
         start = time.perf_counter()
-        images = self.predict_all(frame)
+        images = self.predict_all(frame, camera)
         if view.clean is None and not self.sensor.parts:
             del images["clean"]  # it is the recorded image, judged against the same target
         if images[self.modality].is_cuda:
@@ -450,6 +451,10 @@ class SplatTraining(SceneModel):
     def make_room(self, checkpoint: dict[str, Any]) -> None:
         """Gives every tensor the size that it has in the checkpoint, and takes over what is no tensor."""
         weights = checkpoint["state_dict"]
+        for name in self.thermal.optional.intersection(self.splats.names):
+            if f"splats.raw.{name}" not in weights:
+                self.splats.remove(name)
+                del self._declared[name]
         check_same_method(self, checkpoint)
         stored = {name: tuple(weights[f"splats.raw.{name}"].shape) for name in self.splats.names}
         # What does not learn may have other columns under the weather of today: those of the checkpoint count.
@@ -463,9 +468,9 @@ class SplatTraining(SceneModel):
         own = checkpoint[CHECKPOINT_KEY]
         if self.schedule.load_state_dict(own["schedule"]):
             self.density.load_times(own.get("density_times", {}))
+            if "average" in own:  # of a run that goes on for longer, these updates are not the last ones
+                self._average.load_state_dict(own["average"], self.device)
         self._waiting = {name: own[name] for name in ("gradients", "unwritten") if name in own}
-        if "average" in own:
-            self._average.load_state_dict(own["average"], self.device)
         state = own["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
 

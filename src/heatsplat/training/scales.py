@@ -46,13 +46,17 @@ def check_same_scene(scene: SceneData, scales: Mapping[str, Any]) -> None:
         )
 
 
-def on_scales(scene: SceneData, scales: Mapping[str, Any], *, exactly: bool = False) -> SceneData:
+def on_scales(
+    scene: SceneData, scales: Mapping[str, Any], *, exactly: bool = False, numbered: bool = False
+) -> SceneData:
     """The scene on the scales of a checkpoint (``scales_of``): times since its first frame, image values of its bounds.
 
-    Where the first frame is not among the scene's any more, times stay as they are, and a warning says so.
+    Where the first frame is not among the scene's any more, times stay as they are, and a warning says so; and so does one where
+    test frames were trained on.
 
     Args:
         exactly: its training frames have to be those of the checkpoint (``trained_frames.check_frames``).
+        numbered: they have to have the same numbers.
 
     Raises:
         SceneError: its cameras or frames are not those of the checkpoint.
@@ -68,7 +72,14 @@ def on_scales(scene: SceneData, scales: Mapping[str, Any], *, exactly: bool = Fa
         elif later != 0:
             log.info("times are counted from frame %s, as in training", first)
             scene = _since(scene, later)
-    check_frames(scales.get("frames"), scene, exactly=exactly)
+    check_frames(scales.get("frames"), scene, exactly=exactly, numbered=numbered)
+    trained = {*(scales.get("frames") or {}).get("names", ())}
+    if seen := [frame.name for frame in scene.test.frames if frame.name in trained]:
+        log.warning(
+            "%d of the %d test images of scene '%s' were trained on (%s): their scores, and intervals that are fitted to such "
+            "images, flatter the run. Leave data.split as it was in training, or hold out other images",
+            len(seen), len(scene.test), scene.name, ", ".join(seen[:3]) + ", ..." * (len(seen) > 3),
+        )  # fmt: skip
     here = scene.thermal_range
     if bounds is not None and here is not None and bounds != [here.min_c, here.max_c]:
         log.warning(

@@ -160,12 +160,13 @@ class SceneModel(pl.LightningModule):
         return self.predict_all(frame)[self.modality]
 
     @torch.no_grad()
-    def predict_all(self, frame: Frame) -> dict[str, Tensor]:
+    def predict_all(self, frame: Frame, camera: Camera | None = None) -> dict[str, Tensor]:
         """The image that the camera would record and the images of the model's companions, by modality.
 
-        Last comes "clean", what a camera without the flaws of the sensor chain would record.
+        Last comes "clean", what a camera without the flaws of the sensor chain would record. They are taken from where
+        ``camera`` stands, as in ``render``.
         """
-        output = self.render(frame, depth=self.sensor.needs_depth)
+        output = self.render(frame, depth=self.sensor.needs_depth, camera=camera)
         image, *companions = self._images(output)
         images = (self.sensor(image, frame, output.seen_depth), *companions, image)
         names = (self.modality, *self.thermal.companions, "clean")

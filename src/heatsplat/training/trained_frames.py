@@ -42,7 +42,9 @@ def frames_of(scene: SceneData) -> dict[str, Any]:
     }
 
 
-def check_frames(before: Mapping[str, Any] | None, scene: SceneData, *, exactly: bool = False) -> None:
+def check_frames(
+    before: Mapping[str, Any] | None, scene: SceneData, *, exactly: bool = False, numbered: bool = False
+) -> None:
     """Raises SceneError where a scene is not the one whose frames a checkpoint tells of (``frames_of``), with what changed.
 
     Args:
@@ -50,8 +52,10 @@ def check_frames(before: Mapping[str, Any] | None, scene: SceneData, *, exactly:
         scene: on the clock of the checkpoint.
         exactly: the training frames have to be the same, as for training that goes on. Otherwise the data may be divided in
             another way, and have more or fewer test frames.
+        numbered: those that are left have to have the same numbers, as for a model that knows frames by them. So they have where
+            they are the same.
     """
-    if before is not None and (changes := list(_changes(before, scene, exactly))):
+    if before is not None and (changes := list(_changes(before, scene, exactly, numbered or exactly))):
         raise SceneError(
             f"the data of scene '{scene.name}' are not those of training: {'; '.join(changes)}. Give the data as they were "
             "(data.root, data.scene, data.split), or train again, in another folder"
@@ -91,7 +95,7 @@ def camera_movement(before: Mapping[str, Any], frames: Iterable[Frame]) -> str |
     return None
 
 
-def _changes(before: Mapping[str, Any], scene: SceneData, exactly: bool) -> Iterator[str]:
+def _changes(before: Mapping[str, Any], scene: SceneData, exactly: bool, numbered: bool) -> Iterator[str]:
     """What changed, each in words (``check_frames``)."""
     names, train = before["names"], scene.train.frames
     now = {frame.name: frame for frame in reversed(train if exactly else scene.frames)}  # training frames come first
@@ -110,7 +114,7 @@ def _changes(before: Mapping[str, Any], scene: SceneData, exactly: bool) -> Iter
     if float(shifts.max()) > LATER_S:
         yield f"times of {int((shifts > LATER_S).sum())} training frames differ by up to {float(shifts.max()):.6g} s"
     ids = [before["frame_ids"][row] for row, _ in in_both]
-    if exactly and not missing and not added and ids != [frame.frame_id for _, frame in in_both]:
+    if numbered and not missing and not added and ids != [frame.frame_id for _, frame in in_both]:
         yield "its frames are numbered in another way, as by test frames that were added or removed"
 
 
