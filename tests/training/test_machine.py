@@ -6,9 +6,12 @@ import subprocess
 import sys
 import weakref
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
+from pytorch_lightning.utilities.compile import OptimizedModule
+from torch.optim import Optimizer
 
 from heatsplat import composition
 from heatsplat.kernels import scheduling
@@ -77,3 +80,29 @@ def test_libraries_are_left_out_of_the_search_for_garbage_once(monkeypatch):
     with machine.loading():
         pass
     assert calls == ["disable", "freeze", "enable"]
+
+
+def test_lightning_is_loaded_without_what_no_command_uses_and_who_asks_for_it_later_gets_it(monkeypatch):
+    """The tests load libraries as commands do (conftest.py)."""
+    assert OptimizedModule.__module__ == machine.__name__
+    assert Optimizer.add_param_group.__wrapped__.__dynamo_disable is Optimizer.add_param_group.__wrapped__
+    given = ModuleType("scipy.signal")
+    monkeypatch.setitem(sys.modules, "scipy.signal", given)  # it is there, and stays
+    monkeypatch.delitem(sys.modules, "torch._dynamo", raising=False)
+    with machine._stand_ins():
+        assert sys.modules["scipy.signal"] is given
+        from torch._dynamo import OptimizedModule as none
+
+        assert not isinstance(torch.nn.Linear(1, 1), none)
+
+        @torch.compiler.disable
+        def as_it_is() -> int:
+            return 3
+
+        assert as_it_is() == 3
+    assert sys.modules["scipy.signal"] is given and "torch._dynamo" not in sys.modules
+    monkeypatch.undo()
+    import scipy.signal
+
+    assert len(scipy.signal.windows.hann(5)) == 5
+    assert torch.compile(lambda x: x + 1, backend="eager")(torch.ones(2)).tolist() == [2.0, 2.0]

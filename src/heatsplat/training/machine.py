@@ -6,9 +6,11 @@ import ctypes
 import gc
 import logging
 import os
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from types import ModuleType
 
 # Lightning's remarks that no user can act on: workers, its products, a deprecation of torch, checkpoints of another
 # folder or with other callbacks, SLURM where a run was started by hand, loaders that cannot resume (ours takes the step
@@ -42,17 +44,50 @@ def usual_threads() -> int:
 
 
 @contextmanager
+def _stand_ins() -> Iterator[None]:
+    """While it lasts, next to nothing is found in place of torch's compiler and of SciPy's signals, unless they are there.
+
+    Lightning and torchmetrics load both to tell compiled modules and to add a name to an old SciPy, which takes a third of the
+    time in which a command loads its libraries. Who asks for them afterwards gets them.
+    """
+    compiler, signals = ModuleType("torch._dynamo"), ModuleType("scipy.signal")
+    compiler.OptimizedModule = type("OptimizedModule", (), {})  # what torch.compile makes of a module: none is one
+    compiler.disable = lambda function=None, *_, **__: (lambda given: given) if function is None else function
+    signals.hamming = None  # the name that would be added
+    stand_ins = {module.__name__: module for module in (compiler, signals) if module.__name__ not in sys.modules}
+    sys.modules.update(stand_ins)
+    try:
+        yield
+    finally:
+        for name in stand_ins:
+            del sys.modules[name]
+
+
+def _leave_compiler_out() -> None:
+    """Optimisers would load torch's compiler to tell it to let their methods alone; this is what it would leave there."""
+    from torch.optim import Optimizer
+
+    for name in ("add_param_group", "load_state_dict", "state_dict", "zero_grad"):
+        method = getattr(getattr(Optimizer, name), "__wrapped__", None)
+        if method is not None and "torch._dynamo" not in sys.modules:
+            method.__dynamo_disable = method
+
+
+@contextmanager
 def loading() -> Iterator[None]:
     """The first time in a process, what is loaded meanwhile is left out of the search for garbage, then and later on.
 
     There is none among libraries, and the search takes a third of the time in which a command loads them. Later it would
-    keep what jobs of a sweep have left behind.
+    keep what jobs of a sweep have left behind. Lightning is loaded first, without what no command uses (``_stand_ins``).
     """
     if gc.get_freeze_count():
         yield
         return
     gc.disable()
     try:
+        with _stand_ins():
+            import pytorch_lightning  # noqa: F401
+        _leave_compiler_out()
         yield
     finally:
         gc.freeze()
