@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ROOT / "src"
 OURS = ("heatsplat", "hydra_plugins")
 LIBRARIES = (
+    "loaded_libraries",
     "torch", "pytorch_lightning", "torchmetrics", "torch.utils.tensorboard", "kornia", "numba", "cv2", "skimage.metrics",
     "scipy.stats", "scipy.spatial", "matplotlib.figure", "hydra", "rich.progress", "pvlib",
     "heatsplat.cli", "heatsplat.runs.run", "heatsplat.datamodules.synthetic",
@@ -81,7 +82,8 @@ def forking() -> multiprocessing.context.ForkServerContext:
     """Starts processes as forks of the server, which runs from here on."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(LIBRARIES))
-    with mock.patch.dict(os.environ, PYTHONPATH=str(SOURCES)):  # of this checkout, wherever another is installed
+    places = os.pathsep.join([str(SOURCES), str(ROOT / "tests")])  # of this checkout, wherever another is installed
+    with mock.patch.dict(os.environ, PYTHONPATH=places):
         forkserver.ensure_running()
     return context
 
