@@ -44,7 +44,7 @@ ALLOWED = {
     "composition": {"io", "training", "heatsplat"},
     "explanations": {"composition", "errors", "io"},
     "usage": {"composition"},
-    "doctor": {"contracts", "effects", "io", "physics"},
+    "doctor": {"contracts", "effects", "geometry", "io", "physics"},
     "runs": {
         "contracts",
         "composition",
