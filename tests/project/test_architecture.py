@@ -90,7 +90,7 @@ ALLOWED = {
         "viewer",
     },
     "datamodules": {"contracts", "geometry", "physics", "sensors", "training"},
-    "preparation": {"contracts", "datamodules", "doctor", "geometry", "io", "physics", "runs"},
+    "preparation": {"contracts", "datamodules", "doctor", "export", "geometry", "io", "physics", "runs"},
 }
 BESIDE = ("datamodules", "preparation")  # beside src/; only configurations name what is in them
 BASES_ONLY = {"thermal": {"base"}, "density": {"base", "ops"}, "sensors": {"base"}}  # what training may know
