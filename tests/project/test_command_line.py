@@ -230,6 +230,31 @@ def test_bad_input_is_named_with_exit_code_one(overrides, message, tmp_path, tol
     assert message in told("train", *overrides, f"hydra.run.dir={tmp_path}/run", cwd=tmp_path, code=1)
 
 
+def test_what_is_refused_leaves_no_folder_unless_it_was_given_a_name(tmp_path, told, monkeypatch):
+    monkeypatch.setattr(composition, "ROOT", tmp_path)
+    refused = ("train", "method=etgs", "data=rhd", "data.root=/nowhere/at/all")
+    assert "/nowhere/at/all" in told(*refused, cwd=tmp_path, code=1)
+    assert [*tmp_path.rglob("*")] == [tmp_path / "outputs"]
+    beside = tmp_path / "outputs" / "etgs_all" / "before"
+    beside.mkdir(parents=True)
+    told(*refused, cwd=tmp_path, code=1)
+    assert [*(tmp_path / "outputs").rglob("*")] == [beside.parent, beside]
+    told(*refused, f"hydra.run.dir={tmp_path}/run", cwd=tmp_path, code=1)
+    assert (tmp_path / "run" / "FAILED").exists() and (tmp_path / "run" / "run.log").exists()
+
+
+def test_what_wrote_something_before_it_failed_stays(tmp_path, told, monkeypatch):
+    def fails(config, output_dir):
+        (output_dir / "verdicts.md").touch()
+        raise SceneError("too late")
+
+    monkeypatch.setattr(composition, "ROOT", tmp_path)
+    monkeypatch.setattr("heatsplat.runs.run.train_in", fails)
+    assert "too late" in told("train", "method=etgs", *TINY, cwd=tmp_path, code=1)
+    (kept,) = tmp_path.rglob("verdicts.md")
+    assert (kept.parent / "FAILED").exists()
+
+
 def test_help_lists_the_choices(tmp_path, told):
     output = told("train", "method=etgs", "--help", cwd=tmp_path)
     assert "etgs" in output and "colmap" in output
