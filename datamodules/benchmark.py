@@ -61,7 +61,11 @@ class Benchmark(OutdoorDataModule):
             thermal_range=range_in(folder / META, low, high)[0],
             ambient_c=meta.get("ambient_c"),
             metres_per_unit=meta.get("metres_per_unit"),
-            notes={"source": f"protocol {meta.get('protocol')}, size {meta.get('size')}", "test_images": "exact"},
+            notes={
+                "source": f"protocol {meta.get('protocol')}, size {meta.get('size')}",
+                "test_images": "exact",
+                "cameras": f"{' and '.join(FILES.values())}, OpenGL axes",
+            },
             **self.surroundings.read(folder, meta, frames),
         )
 

@@ -25,6 +25,7 @@ from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.side_files import read_table
+from heatsplat.export.place import placed, unit_in_metres
 from heatsplat.geometry.sight_lines import cosines, distances, normals
 from heatsplat.io.pictures import Bar, Panel, colorize, write_png
 from heatsplat.io.pictures import compose as side_by_side
@@ -143,7 +144,7 @@ def correct(
         conditions: arguments of ``GivenConditions``; None takes those of the preparation.
         band_um: wavelengths in which the camera sees, where the preparation did not keep its calibration.
         refractive_index: of the surfaces, above 1; None for an emissivity without an angle.
-        metres_per_unit: scale of the world; None takes the scene's.
+        metres_per_unit: scale of the world; None takes the scene's, or that of its cameras' positions.
         downscale: factor by which images shrink first, whatever the run was trained at; None is what it was trained at.
         trust: classes of yours that the checkpoint may name.
 
@@ -163,8 +164,13 @@ def correct(
         GivenConditions(**conditions),
         BandResponse(Band(*band_um, nodes=16)),
         refractive_index,
-        metres_per_unit or trained.scene.metres_per_unit,
+        metres_per_unit or scale_of(trained.scene),
     )
+
+
+def scale_of(scene: SceneData) -> float | None:
+    """Metres of one unit of a scene, by itself or by the positions of its cameras; None where neither tells."""
+    return unit_in_metres(scene, None if scene.metres_per_unit is not None else placed(scene))
 
 
 def correct_scene(
@@ -245,7 +251,7 @@ def _check(
     if not metres_per_unit:
         raise SceneError(
             "the scale of the scene is not known, and the air between camera and surface counts in metres: give "
-            "correct.metres_per_unit (poses with GPS have 1)"
+            "correct.metres_per_unit (poses with GPS have 1), or the positions of the cameras in frames.csv"
         )
     check_numbers("correct.metres_per_unit", metres_per_unit, error=SceneError, above=0)
     if index is not None:

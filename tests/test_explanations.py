@@ -9,7 +9,9 @@ import yaml
 from hydra.errors import ConfigCompositionException, InstantiationException, OverrideParseException
 
 from heatsplat import composition
+from heatsplat.errors import SceneError
 from heatsplat.explanations import _quoted, expected, explain, sentence
+from heatsplat.runs.lock import OccupiedError
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -46,6 +48,21 @@ def test_a_disk_that_takes_no_file_needs_no_traceback(code):
     error = OSError(code, os.strerror(code), "/read/only/run.log")
     assert expected(error) is error and sentence(error).startswith("/read/only/run.log: ")
     assert expected(OSError(errno.EIO, "broken")) is None
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (SceneError("data.root is not set"), "data.root is not set"),
+        (OccupiedError("it holds a run"), "it holds a run"),
+        (FileNotFoundError(errno.ENOENT, "No such file or directory", "a.csv"), "a.csv: No such file or directory"),
+        (FileNotFoundError("no table"), "no table"),
+        (ImportError("gsplat is not installed"), "gsplat is not installed"),
+        (FloatingPointError(), "FloatingPointError"),
+    ],
+)
+def test_errors_are_told_without_the_names_of_their_classes(error, told):
+    assert sentence(error) == told == explain(error, "train", [])
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("conf/*.yaml")), ids=lambda path: path.stem)

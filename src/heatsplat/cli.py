@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import logging
 import os
+import shutil
 import signal
 import sys
 import traceback
@@ -27,7 +28,7 @@ from heatsplat.errors import SceneError, check_count, check_numbers, check_optio
 from heatsplat.explanations import expected, explain, sentence
 from heatsplat.io.files import size_told, write_atomically
 from heatsplat.io.results import FAILED, METRICS_FILE
-from heatsplat.runs.lock import OccupiedError, locked
+from heatsplat.runs.lock import LOCK_FILE, OccupiedError, locked
 from heatsplat.runs.signals import stoppable
 from heatsplat.training.machine import clear_away, loading, prepare_machine
 from heatsplat.usage import usage
@@ -154,7 +155,8 @@ def _job(
     The configuration comes as plain containers (``composition.plain``). ``check`` may raise OccupiedError: it comes before
     anything in the folder is changed.
 
-    In a sweep the exception goes on to Hydra, which runs the other jobs; a single run ends with exit code 1.
+    In a sweep the exception goes on to Hydra, which runs the other jobs; a single run ends with exit code 1. Where it was refused
+    before it wrote anything, it leaves no folder, unless that was given a name.
     """
 
     @functools.wraps(work)
@@ -177,9 +179,28 @@ def _job(
             if hydra_config.mode == RunMode.MULTIRUN or cause is None:
                 raise
             log.error("%s", sentence(cause))
+            if (
+                "${now:" in OmegaConf.to_container(hydra_config.run, resolve=False)["dir"]
+            ):  # no folder that was there before
+                _remove_unused(output_dir, f"{hydra_config.job.name}.log")
             sys.exit(1)
 
     return job
+
+
+def _remove_unused(folder: Path, log_file: str) -> None:
+    """Removes the folder of a job, and the one around it where it was the first in there, if nothing lies in it but what every
+    job leaves."""
+    if not {path.name for path in folder.iterdir()} <= {".hydra", LOCK_FILE, log_file, FAILED}:
+        return
+    root = logging.getLogger()
+    for handler in root.handlers[:]:
+        if isinstance(handler, logging.FileHandler) and Path(handler.baseFilename).parent == folder.resolve():
+            root.removeHandler(handler)
+            handler.close()
+    with suppress(OSError):  # others lie beside it, or a file is in use
+        shutil.rmtree(folder)
+        folder.parent.rmdir()
 
 
 def _prepare_machine(threads: int | None) -> None:

@@ -60,13 +60,14 @@ def expected(error: BaseException) -> BaseException | None:
 
 
 def sentence(error: BaseException) -> str:
-    """What is printed of an error that is the user's to mend."""
+    """What is printed of an error that is the user's to mend: what it says, without the name of its class."""
     if told := _of_building(error):
         return told
-    remedy = NO_PLACE.get(error.errno) if isinstance(error, OSError) else None
-    if remedy is None:
-        return f"{type(error).__name__}: {error}"
-    return f"{error.filename}: {error.strerror}; {remedy}" if error.filename else f"{error.strerror}; {remedy}"
+    if not isinstance(error, OSError) or error.strerror is None:
+        return str(error) or type(error).__name__
+    told = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    remedy = NO_PLACE.get(error.errno)
+    return told if remedy is None else f"{told}; {remedy}"
 
 
 def _of_composing(error: Exception, command: str, arguments: Sequence[str]) -> str | None:

@@ -1,5 +1,6 @@
 """The table and the picture of hot and cold surfaces, of a wall whose left half is warm."""
 
+import logging
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -45,17 +46,34 @@ def test_images_that_are_no_temperatures_have_none(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_surfaces_have_a_place_on_the_earth_where_cameras_do(monkeypatch):
-    shifted = Similarity(torch.tensor(1.0), torch.eye(3).double(), torch.tensor([599_000.0, 5_695_000.0, 0.0]).double())
-    monkeypatch.setattr(surfaces, "place_of", lambda scene, gps: Place(shifted, "EPSG:32631", "metre"))
+@pytest.fixture
+def place(monkeypatch):
+    """A place on the earth where a unit of the scene is 3 m."""
+    shift = torch.tensor([599_000.0, 5_695_000.0, 0.0]).double()
     monkeypatch.setattr(Place, "latitudes_longitudes", lambda self, points: [(51.4, 4.43)] * len(points))
-    scene, points = replace(wall(), positions="frames.csv"), [torch.tensor([1.0, 2.0, -3.0]).double()]
-    (told,) = surfaces.on_earth(scene, points)
+    return Place(Similarity(torch.tensor(3.0).double(), torch.eye(3).double(), shift), "EPSG:32631", "metre")
+
+
+def test_surfaces_have_a_place_on_the_earth_where_cameras_do(place):
+    points = [torch.tensor([1.0, 2.0, -3.0]).double()]
+    (told,) = surfaces.on_earth(place, points)
     assert told == {
-        "crs": "EPSG:32631", "east_m": 599_001.0, "north_m": 5_695_002.0, "height_m": -3.0,
+        "crs": "EPSG:32631", "east_m": 599_003.0, "north_m": 5_695_006.0, "height_m": -9.0,
         "latitude_deg": 51.4, "longitude_deg": 4.43,
     }  # fmt: skip
-    assert surfaces.on_earth(wall(), points) == [{}]
+    assert surfaces.on_earth(None, points) == [{}]
+
+
+@pytest.mark.parametrize(("metres", "area"), [(None, 0.2 * 9), (2.0, 0.2 * 4)])
+def test_areas_are_in_metres_where_cameras_have_positions(tmp_path, monkeypatch, place, caplog, metres, area):
+    monkeypatch.setattr(surfaces, "placed", lambda scene: place)
+    scene = replace(wall(), positions="frames.csv", metres_per_unit=metres)
+    module = SimpleNamespace(scene=scene, modality="thermal", output_dir=tmp_path, render=render)
+    with caplog.at_level(logging.INFO):
+        ExtremeSurfaces(views=4, share=0.02).on_test_epoch_end(None, module)
+    hottest = read_csv(tmp_path / SURFACES_FILE)[0]
+    assert hottest["area"] == pytest.approx(area, rel=0.2) and hottest["unit"] == "m²"
+    assert ("taken for 3 m, by the positions of its cameras in frames.csv" in caplog.text) == (metres is None)
 
 
 def test_surfaces_lie_beside_the_points_that_were_measured():

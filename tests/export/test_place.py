@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from heatsplat.contracts import SceneError, ViewSet
-from heatsplat.export.place import place_of
+from heatsplat.export.place import place_of, placed, unit_in_metres
 
 rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (pip install -e '.[dev]')")
 
@@ -61,6 +61,16 @@ def test_the_scene_s_own_table_is_taken_unless_it_places_nothing(cooling, tmp_pa
     (tmp_path / "few.csv").write_text("file,lat,lon,alt\nother.png,47,9,500\n")
     assert place_of(replace(scene, positions=tmp_path / "few.csv"), "auto").crs is None
     assert "has positions of 0 of the images" in caplog.text and "no place on the earth" in caplog.text
+
+
+def test_positions_tell_the_scale_where_the_scene_does_not(cooling, tmp_path):
+    scene = replace(cooling.module.scene, metres_per_unit=None)
+    assert placed(scene) is None and unit_in_metres(scene, None) is None
+    scene = replace(scene, positions=table(scene, tmp_path / "frames.csv"))
+    assert unit_in_metres(scene, placed(scene)) == pytest.approx(2.0, abs=1e-5)
+    assert unit_in_metres(replace(scene, metres_per_unit=5.0), placed(scene)) == 5.0
+    (tmp_path / "few.csv").write_text("file,lat,lon,alt\nother.png,47,9,500\n")
+    assert placed(replace(scene, positions=tmp_path / "few.csv")) is None
 
 
 def strip(scene, wander=0.0):

@@ -265,6 +265,18 @@ def test_what_cannot_be_corrected_is_refused_with_the_remedy(tmp_path, change, s
         )  # fmt: skip
 
 
+@pytest.mark.parametrize(("own", "scale"), [(None, 3.0), (2.0, 2.0)])
+def test_positions_tell_the_scale_where_the_scene_does_not(monkeypatch, own, scale):
+    monkeypatch.setattr(correction, "placed", lambda scene: SimpleNamespace(scale=3.0))
+    floor = SimpleNamespace(metres_per_unit=own, name="floor", positions="frames.csv")
+    trained = SimpleNamespace(config={"data": {"root": None}}, scene=floor, depth=None)
+    monkeypatch.setattr(correction, "load", lambda ckpt, **given: trained)
+    monkeypatch.setattr(correction, "correct_scene", lambda *given: given[-1])
+    settings = {"conditions": {}, "band_um": (8, 14), "refractive_index": None}
+    assert correction.correct("a.ckpt", None, metres_per_unit=None, **settings) == scale
+    assert correction.correct("a.ckpt", None, metres_per_unit=7.0, **settings) == 7.0
+
+
 def test_the_scene_itself_is_no_target(tmp_path):
     (tmp_path / "a").mkdir()
     with pytest.raises(SceneError, match="is the folder of the scene that is to be corrected.*give another one"):

@@ -44,7 +44,7 @@ ALLOWED = {
     "composition": {"io", "training", "heatsplat"},
     "explanations": {"composition", "errors", "io"},
     "usage": {"composition"},
-    "doctor": {"contracts", "effects", "io", "physics"},
+    "doctor": {"contracts", "effects", "geometry", "io", "physics"},
     "runs": {
         "contracts",
         "composition",
@@ -90,7 +90,7 @@ ALLOWED = {
         "viewer",
     },
     "datamodules": {"contracts", "geometry", "physics", "sensors", "training"},
-    "preparation": {"contracts", "datamodules", "doctor", "geometry", "io", "physics", "runs"},
+    "preparation": {"contracts", "datamodules", "doctor", "export", "geometry", "io", "physics", "runs"},
 }
 BESIDE = ("datamodules", "preparation")  # beside src/; only configurations name what is in them
 BASES_ONLY = {"thermal": {"base"}, "density": {"base", "ops"}, "sensors": {"base"}}  # what training may know

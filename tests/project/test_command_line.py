@@ -130,7 +130,7 @@ def test_evaluate_keeps_what_a_run_has_measured(finished):
     assert {"metrics.json", "report.md", "test_per_image.csv", "config.yaml"} <= {path.name for path in kept}
     ckpt = f"ckpt={finished}/checkpoints/last.ckpt"
     told = command("evaluate", ckpt, f"hydra.run.dir={finished}", cwd=finished, code=1)
-    assert f"OccupiedError: {finished} holds a run or results" in told
+    assert f"\n{finished} holds a run or results" in f"\n{told}" and "OccupiedError" not in told
     assert all(path.read_bytes() == content for path, content in kept.items()) and not (finished / "FAILED").exists()
 
 
@@ -231,6 +231,31 @@ def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path, 
 )
 def test_bad_input_is_named_with_exit_code_one(overrides, message, tmp_path, told):
     assert message in told("train", *overrides, f"hydra.run.dir={tmp_path}/run", cwd=tmp_path, code=1)
+
+
+def test_what_is_refused_leaves_no_folder_unless_it_was_given_a_name(tmp_path, told, monkeypatch):
+    monkeypatch.setattr(composition, "ROOT", tmp_path)
+    refused = ("train", "method=etgs", "data=rhd", "data.root=/nowhere/at/all")
+    assert "/nowhere/at/all" in told(*refused, cwd=tmp_path, code=1)
+    assert [*tmp_path.rglob("*")] == [tmp_path / "outputs"]
+    beside = tmp_path / "outputs" / "etgs_all" / "before"
+    beside.mkdir(parents=True)
+    told(*refused, cwd=tmp_path, code=1)
+    assert [*(tmp_path / "outputs").rglob("*")] == [beside.parent, beside]
+    told(*refused, f"hydra.run.dir={tmp_path}/run", cwd=tmp_path, code=1)
+    assert (tmp_path / "run" / "FAILED").exists() and (tmp_path / "run" / "run.log").exists()
+
+
+def test_what_wrote_something_before_it_failed_stays(tmp_path, told, monkeypatch):
+    def fails(config, output_dir):
+        (output_dir / "verdicts.md").touch()
+        raise SceneError("too late")
+
+    monkeypatch.setattr(composition, "ROOT", tmp_path)
+    monkeypatch.setattr("heatsplat.runs.run.train_in", fails)
+    assert "too late" in told("train", "method=etgs", *TINY, cwd=tmp_path, code=1)
+    (kept,) = tmp_path.rglob("verdicts.md")
+    assert (kept.parent / "FAILED").exists()
 
 
 def test_help_lists_the_choices(tmp_path, told):

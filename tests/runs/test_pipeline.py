@@ -376,6 +376,14 @@ def test_a_first_stage_of_two_lengths_is_refused(method):
         checked(heatsplat.compose([f"method={method}", "first_steps=30", "max_steps=30"]))
 
 
+def test_a_file_to_start_from_that_is_not_there_is_told_before_data_are_read(tmp_path):
+    given = ["method=auto", "init=pretrained", f"init.path={tmp_path}/a.ply"]
+    with pytest.raises(SceneError, match=r"init.path=.*a.ply: there is no such file"):
+        checked(heatsplat.compose(given))
+    (tmp_path / "a.ply").touch()
+    assert checked(heatsplat.compose(given))["init"]["path"].endswith("a.ply")
+
+
 def test_what_the_machine_lacks_is_told_before_data_are_read(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(SceneError, match="trainer.accelerator=cuda: PyTorch sees no CUDA device"):

@@ -9,6 +9,7 @@ import torch
 from running import TINY
 
 from heatsplat.composition import build, compose
+from heatsplat.contracts import SceneError
 from heatsplat.geometry.neighbours import neighbour_distances
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.io.ply import read_splats, write_splats
@@ -121,3 +122,35 @@ def test_a_file_of_temperatures_starts_a_thermal_model_in_the_bounds_of_the_scen
     splats, _ = start(scene, thermal, seed=0)
     values = 0.5 + C0 * splats["sh0"][:, 0, 0].detach().numpy()
     np.testing.assert_allclose(values, np.linspace(0, 1, 50), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("move", "told"),
+    [
+        (
+            lambda means, scene: torch.cat([means[:5], -50.0 * torch.ones(45, 3)]),
+            "training views see 10 % of its Gauss",
+        ),
+        (lambda means, scene: means.mean(0) + 1e-3 * (means - means.mean(0)), "its Gaussians extend over 0.00"),
+        (lambda means, scene: means, ""),
+    ],
+)
+def test_gaussians_of_another_world_are_warned_of(parts, tmp_path, caplog, move, told):
+    scene, thermal = parts
+    means = move(scene.points[:50], scene)
+    write_splats(
+        tmp_path / "a.ply", means, torch.full((50, 3), -2.0), torch.ones(50, 4), torch.zeros(50), torch.rand(50, 3)
+    )
+    with caplog.at_level(logging.WARNING):
+        Pretrained(str(tmp_path / "a.ply"))(scene, thermal, seed=0)
+    assert told in caplog.text and ("another world: give a .ply" in caplog.text) == bool(told)
+
+
+def test_gaussians_that_no_view_sees_are_refused(parts, tmp_path):
+    scene, thermal = parts
+    behind = scene.train.frames[0].camera.center.float() + 1e4 * torch.tensor([0.0, -1.0, 0.0])
+    write_splats(
+        tmp_path / "a.ply", behind.expand(9, 3), torch.zeros(9, 3), torch.ones(9, 4), torch.zeros(9), torch.rand(9, 3)
+    )
+    with pytest.raises(SceneError, match=r"a.ply: no training view of scene '.*' sees any of its Gaussians: give a"):
+        Pretrained(str(tmp_path / "a.ply"))(scene, thermal, seed=0)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from heatsplat.callbacks.images import scene_bounds
 from heatsplat.contracts import Frame, SceneData, evenly_spread
-from heatsplat.export.place import AUTO, place_of
+from heatsplat.export.place import Place, placed, unit_in_metres
 from heatsplat.geometry.coverage import DEPTH_TOLERANCE, surface_depth
 from heatsplat.geometry.extremes import Surface, extremes
 from heatsplat.geometry.looks import Look
@@ -36,8 +36,9 @@ class ExtremeSurfaces(pl.Callback):
     """Writes surfaces.csv and renders/surfaces.png at the end of the test, of scenes that have temperatures.
 
     As the model renders them, without what the camera adds, at the moment of the training image nearest to the middle of the
-    record. Areas are those of what training views see, in square metres where the scene's scale is known. The table tells where
-    surfaces lie in the world, and on the earth where the scene's camera positions do (``export.place``).
+    record. Areas are those of what training views see, in square metres where the scene's scale is known, by itself or by the
+    positions of its cameras (the log names these). The table tells where surfaces lie in the world, and on the earth where the
+    scene's camera positions do (``export.place``).
 
     Args:
         views: training views from which surfaces are looked for, spread evenly.
@@ -55,7 +56,8 @@ class ExtremeSurfaces(pl.Callback):
         frames = [middle(scene, scene.train.frames[i]) for i in evenly_spread(len(scene.train), self.views)]
         looks = [look(module, frame) for frame in frames]
         hot, cold = extremes(looks, self.share, self.count, reach(scene))
-        metres = scene.metres_per_unit
+        place = placed(scene) if hot or cold else None
+        metres = unit_in_metres(scene, place)
         unit, square = ("m", metres**2) if metres else ("units", 1.0)
         rows = [
             {
@@ -72,7 +74,7 @@ class ExtremeSurfaces(pl.Callback):
             for number, one in enumerate(found, start=1)
         ]
         if rows:
-            for row, places in zip(rows, on_earth(scene, [one.centre for one in (*hot, *cold)]), strict=True):
+            for row, places in zip(rows, on_earth(place, [one.centre for one in (*hot, *cold)]), strict=True):
                 row.update(places)
             write_csv(module.output_dir / SURFACES_FILE, rows)
             write_png(module.output_dir / SURFACES_PICTURE, picture(looks, hot, cold, scene, frames[0].time_s))
@@ -88,13 +90,9 @@ def reach(scene: SceneData) -> tuple[Tensor, Tensor] | None:
     return low.double() - beside, high.double() + beside
 
 
-def on_earth(scene: SceneData, points: Sequence[Tensor]) -> list[dict[str, Any]]:
+def on_earth(place: Place | None, points: Sequence[Tensor]) -> list[dict[str, Any]]:
     """Columns for the place of each point [3] on the earth; none where the scene does not lie there."""
-    try:
-        place = place_of(scene, AUTO) if scene.positions is not None else None
-    except ImportError:  # of the extra "export"
-        place = None
-    if place is None or place.crs is None:
+    if place is None:
         return [{}] * len(points)
     stacked = torch.stack([*points])
     metres, degrees = place(stacked).tolist(), place.latitudes_longitudes(stacked)

@@ -25,6 +25,7 @@ MAX_PIXELS = 1500  # of a camera that stands still
 COARSE = 64  # pixels of the shorter side of images whose edges are compared
 # Points and frames from which it can be told what all points do from frame to frame.
 MIN_POINTS, MIN_FRAMES = 40, 5
+LATER_S = 1800.0  # what sun and shade do in longer makes the same surface look like another
 FRAMES_PER_LENS = 4  # fewer frames for each lens come of tools that fit one to every image
 
 
@@ -72,6 +73,9 @@ class Material:
         answers: [F, k] how surfaces answer recorded weather in the frames of ``images``; None without a record.
         lenses: for every frame, the number of the camera that took it; empty where one took all.
         without_camera: how many images of a model's folder have no camera in it, and how many images there are.
+        poses_in: where poses come from, in words.
+        poses_are: what the matrices there are read as, in the words of ``checks.conventions``.
+        origin: what was subtracted from the world of these files.
     """
 
     names: Sequence[str]
@@ -92,6 +96,9 @@ class Material:
     answers: Tensor | None = None
     lenses: Sequence[int] = ()
     without_camera: tuple[int, int] = (0, 0)
+    poses_in: str = "the sparse model"
+    poses_are: str = "world-to-camera in OpenCV axes"
+    origin: Sequence[float] = (0.0, 0.0, 0.0)
 
     @cached_property
     def chosen_times_s(self) -> Tensor | None:
@@ -138,6 +145,12 @@ class Material:
         """Whether every frame shows what the middle one shows, but for its level, noise and gain."""
         middle = len(self.images) // 2
         return all(self._alike(f, middle) > SAME for f in range(len(self.images)) if f != middle)
+
+    def near_in_time(self, frame: int) -> Tensor:
+        """Frames [F] bool of ``images`` that were taken so close to one that heat has not changed what they show."""
+        if self.chosen_times_s is None:
+            return torch.ones(len(self.images), dtype=torch.bool)
+        return (self.chosen_times_s - self.chosen_times_s[frame]).abs() <= LATER_S
 
     def _alike(self, frame: int, other: int) -> float:
         """Correlation of two images, without what noise takes of it; 0 where one shows nothing beside noise."""
@@ -217,6 +230,8 @@ def material_of(scene: SceneData) -> Material:
         answers=drivers(scene.weather, seen_s, air=(QUICK_PER_S, SLOW_PER_S)),
         lenses=_lenses(frames),
         without_camera=_without_camera(scene),
+        **_poses(scene),
+        origin=scene.notes.get("origin", (0.0, 0.0, 0.0)),
     )
 
 
@@ -241,6 +256,12 @@ def _without_camera(scene: SceneData) -> tuple[int, int]:
     """How many images have no camera, and how many images there are; as far as the loader noted them."""
     lost = int(str(scene.notes.get("images_unregistered", "0")).split()[0])
     return lost, lost + len(scene.train) + len(scene.test)
+
+
+def _poses(scene: SceneData) -> dict[str, str]:
+    """Where the poses of a scene come from, and what its matrices are read as, where they do not come from a sparse model."""
+    files, _, axes = str(scene.notes.get("cameras", "")).rpartition(", ")
+    return {"poses_in": files, "poses_are": f"camera-to-world in {axes}"} if axes.endswith(" axes") else {}
 
 
 def coarse(image: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -16,6 +16,7 @@ from rich.table import Table
 from heatsplat.contracts import SceneData
 from heatsplat.doctor import checks
 from heatsplat.doctor.base import Check, Finding, Material, material_of
+from heatsplat.doctor.checks import conventions
 from heatsplat.io.files import write_atomically
 
 log = logging.getLogger("heatsplat")
@@ -32,7 +33,10 @@ def examine(material: Material) -> list[Finding]:
     """What is wrong, the most costly first; empty where nothing is."""
     if not len(material.images):
         return []
-    found = [finding for check in CHECKS for finding in check.find(material)]
+    found = conventions.CHECK.find(material)
+    # What misread poses say of points, and points of images, is no finding of its own.
+    seen = replace(material, points=None) if found else material
+    found += [finding for check in CHECKS if check is not conventions.CHECK for finding in check.find(seen)]
     return sorted(found, key=lambda finding: -finding.cost)
 
 

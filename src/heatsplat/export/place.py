@@ -117,6 +117,26 @@ def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | No
     return Place(Similarity(scale, rotation, shift), None, "unit of the scene" if metres is None else "metre")
 
 
+def placed(scene: SceneData) -> Place | None:
+    """Where a scene lies on the earth by its own camera positions, as by ``place_of``; None where it has none that tell, or where
+    rasterio is not installed."""
+    try:
+        place = None if scene.positions is None else place_of(scene, AUTO)
+    except ImportError:  # of the extra "export"
+        return None
+    return None if place is None or place.crs is None else place
+
+
+def unit_in_metres(scene: SceneData, place: Place | None) -> float | None:
+    """Metres of one unit of a scene: its own scale, else that of its place on the earth (``placed``), which is logged; None where
+    neither is known."""
+    if scene.metres_per_unit is not None or place is None:
+        return scene.metres_per_unit
+    log.info("one unit of scene '%s' is taken for %.4g m, by the positions of its cameras in %s", scene.name, place.scale,
+             scene.positions)  # fmt: skip
+    return place.scale
+
+
 def upright(moment: Moment) -> tuple[Tensor, Tensor, Tensor]:
     """Means [N, 3], rotations [N, 4] wxyz and scales [N, 3] with y up and z towards the south (or the viewer), in metres.
 

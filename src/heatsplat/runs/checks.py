@@ -17,10 +17,12 @@ from heatsplat.io.settings import at, walk
 from heatsplat.runs.budget import seconds_of
 from heatsplat.runs.declared import check_declared
 from heatsplat.runs.device import device_of
+from heatsplat.training.init import Pretrained, check_start
 
 # Learning rates in the group "optim"; elsewhere they are lr, lr_*.
 RATES = ("means", "log_scales", "quats", "opacity_logits")
 WEIGHTS = ("weight", "_l2", "_penalty")  # endings of the names of weights; "weights" holds more of them
+PRETRAINED = f"{Pretrained.__module__}.{Pretrained.__qualname__}"
 MAX_THREADS_PER_CORE = 4  # more only wait for each other
 
 
@@ -36,7 +38,8 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
 
     Raises:
         SceneError: settings contradict each other, are of another kind than is asked for or asked for by nothing, lie out of
-            range, were changed where nothing reads them any more, or need what this machine lacks.
+            range, were changed where nothing reads them any more, or need what this machine lacks; or there is no file to start
+            from.
         ImportError: the renderer is not installed.
     """
     _check_ranges(config)
@@ -45,6 +48,8 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
     _check_first_stage(config)
     check_last_stage(config)
     _check_machine(config)
+    if config["init"]["_target_"] == PRETRAINED and config["init"]["path"] is not None:
+        check_start(config["init"]["path"])
     if config["budget"] is not None:
         config = config | {"budget": seconds_of(config["budget"])}
         if "max_steps" in keys_of(config["overrides"]):

@@ -28,6 +28,10 @@ MIN_SQUARED_DISTANCE = 1e-7
 LONE_SIZE = 0.1  # semi-axis in extents of a Gaussian that is the only one and has no neighbours
 ABSENT = -30.0  # logit of an opacity of 1e-13: what no renderer shows and no gradient reaches
 SAMPLED_VIEWS = 64  # image values at the points come from this many views at most, evenly spread
+# Share of Gaussians in view below which they may be of another world, and the factor between their size and that of the scene's
+# points from which they may. Those of a run on the same images are nearly all in view; of a larger survey a part is.
+FEW_SEEN, ANOTHER_SIZE = 0.2, 10.0
+MAX_MEASURED = 100_000  # Gaussians that tell both
 # What a point cloud may hold beside the geometry, in words (``read_splats``).
 APPEARANCE = {"values": "colours", "sh_rest": "spherical harmonics", "temperature_k": "temperatures"}
 
@@ -170,14 +174,16 @@ class Pretrained(Start):
     """Splats whose geometry and opacity are those of an earlier run or of a file.
 
     Heat starts as it does elsewhere, but for a model of the images that a file holds: of colours, of visible images, or of
-    temperatures, where the scene has bounds. What is not taken is logged.
+    temperatures, where the scene has bounds. What is not taken is logged; Gaussians that are hardly in view, or of another size
+    than the scene, are warned of.
 
     Args:
         path: a point cloud .ply in the layout of 3DGS, or a checkpoint .ckpt of heatsplat, in the world of the scene. A
             restored run reads it again.
 
     Raises:
-        SceneError: there is no such file, or it holds no splats, or anchors where Gaussians are wanted.
+        SceneError: there is no such file, or it holds no splats, or anchors where Gaussians are wanted, or no training view sees
+            any of them.
     """
 
     def __init__(self, path: str | None) -> None:
@@ -189,10 +195,7 @@ class Pretrained(Start):
         self, scene: SceneData, thermal: ThermalModel, seed: int, cap_max: float | None = None
     ) -> tuple[Splats, dict[str, PerGaussian]]:
         """Splats for a scene, and what the thermal model declared about its tensors; more than ``cap_max`` are all kept."""
-        if not self.path.is_file():
-            raise SceneError(
-                f"init.path={self.path}: there is no such file (a run that started from one needs it again)"
-            )
+        check_start(self.path)
         if self.path.suffix == ".ply":
             geometry, appearance = _splats_of_file(self.path)
         else:
@@ -201,6 +204,7 @@ class Pretrained(Start):
         if geometry["opacity_logits"].shape[1] != wanted:  # of another number of modalities: all start from the first
             geometry["opacity_logits"] = geometry["opacity_logits"][:, :1].repeat(1, wanted)
         log.info("%d Gaussians from %s", len(geometry["means"]), self.path)
+        _check_world(self.path, geometry["means"], scene)
         values = _take_values(appearance, scene, thermal)
         splats, declared = with_heat(geometry, scene, thermal, seed, values)
         _take_harmonics(appearance, splats)
@@ -208,6 +212,42 @@ class Pretrained(Start):
             left = ", ".join(APPEARANCE[name] for name in appearance)
             log.info("init.path: %s of the file are not taken: they are not what this model starts from", left)
         return splats, declared
+
+
+def check_start(path: Path | str) -> None:
+    """Raises SceneError where there is no file at a path that splats are to start from."""
+    if not Path(path).expanduser().is_file():
+        raise SceneError(f"init.path={path}: there is no such file (a run that started from one needs it again)")
+
+
+def _check_world(path: Path, means: Tensor, scene: SceneData) -> None:
+    """Warns of Gaussians at ``means`` that may be of another world than the scene. Raises SceneError where none is in view."""
+    means = means[:: max(1, len(means) // MAX_MEASURED)]
+    if not len(means):
+        return
+    seen = torch.zeros(len(means), dtype=torch.bool)
+    for position in evenly_spread(len(scene.train), SAMPLED_VIEWS):
+        camera = scene.train.frames[position].camera
+        pixels, depths = camera.project(means)
+        seen |= (depths > 0) & (pixels > 0).all(1) & (pixels < pixels.new_tensor([camera.width, camera.height])).all(1)
+    share = float(seen.double().mean())
+    remedy = "give a .ply or a checkpoint in the coordinates of this scene, or take init=sfm"
+    if share == 0:
+        raise SceneError(
+            f"init.path={path}: no training view of scene '{scene.name}' sees any of its Gaussians: {remedy}"
+        )
+    if share < FEW_SEEN:
+        log.warning(
+            "init.path=%s: training views see %.2g %% of its Gaussians, which may be of another world: %s",
+            path, 100 * share, remedy,
+        )  # fmt: skip
+    low, high = torch.quantile(means.float(), torch.tensor([0.01, 0.99]), dim=0)
+    size, own = float((high - low).max()), scene.bulk[1]
+    if "points_random" not in scene.notes and not 1 / ANOTHER_SIZE < size / own < ANOTHER_SIZE:
+        log.warning(
+            "init.path=%s: its Gaussians extend over %.3g world units and the points of scene '%s' over %.3g, so they may be of "
+            "another world: %s", path, size, scene.name, own, remedy,
+        )  # fmt: skip
 
 
 def _drawn(points: Tensor, most: float, generator: torch.Generator) -> Tensor:

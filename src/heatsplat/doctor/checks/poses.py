@@ -21,7 +21,6 @@ WRONG = 1 / 3  # share of such frames from which poses are wrong; panes and what
 # Cosine between two cameras' axes, 18°: with exact poses, patches are alike at one to three in four points at 2 to 12°, and at
 # one in four at 24 to 31°, where surfaces no longer look as if they faced the camera.
 SAME_WAY = 0.95
-LATER_S = 1800.0  # what sun and shade do in longer makes the same surface look like another
 
 
 def find(material: Material) -> list[Finding]:
@@ -31,7 +30,7 @@ def find(material: Material) -> list[Finding]:
     points = points[torch.tensor(evenly_spread(len(points), CANDIDATES))].double()
     shifts, shares, names = [], [], []
     for one in evenly_spread(len(cameras), PAIRS):
-        other = _beside(cameras, one, _near_in_time(material, one))
+        other = _beside(cameras, one, material.near_in_time(one))
         if other is None:
             continue
         told = _shifts(material, one, other, points)
@@ -61,14 +60,6 @@ def find(material: Material) -> list[Finding]:
             bad,
         )
     ]
-
-
-def _near_in_time(material: Material, one: int) -> Tensor:
-    """Frames [F] bool that were taken so close to one that heat has not changed what they show."""
-    times = material.chosen_times_s
-    if times is None:
-        return torch.ones(len(material.images), dtype=torch.bool)
-    return (times - times[one]).abs() <= LATER_S
 
 
 def _beside(cameras: list[Camera], one: int, near: Tensor) -> int | None:
