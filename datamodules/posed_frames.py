@@ -12,6 +12,7 @@ import numpy as np
 
 from heatsplat.contracts import SceneError, counted
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.datamodules.formats import temperature_table
 from heatsplat.datamodules.formats.colmap import SparseModel
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
@@ -28,6 +29,12 @@ def image_index(folder: Path, images: str, key: str) -> ImageIndex:
     index = ImageIndex(folder / images)
     if not index.names:
         what = "holds no image" if index.folder.is_dir() else "does not exist"
+        table = next(index.folder.rglob(f"*{temperature_table.SUFFIX}"), None)
+        if table is not None:
+            what += (
+                f", but tables such as {table.name}: python src/prepare.py source={index.folder} target=NEW_FOLDER poses=given "
+                f"poses.model={folder} makes a scene of tables of °C"
+            )
         raise SceneError(f"{key}={images}: {index.folder} {what}")
     return index
 

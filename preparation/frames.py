@@ -26,6 +26,8 @@ from heatsplat.datamodules.formats.images import (
     to_grey,
 )
 from heatsplat.datamodules.formats.radiometric import read_bytes
+from heatsplat.datamodules.formats.temperature_table import SUFFIX as TABLE
+from heatsplat.datamodules.formats.temperature_table import read_temperature_table
 from heatsplat.datamodules.timestamps import dji_time, instant, zone_of
 from heatsplat.io.files import by_numbers
 from heatsplat.preparation.devices import devices_of, listed
@@ -100,9 +102,11 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         raise SceneError(f"source={folder} is no folder")
     kinds: dict[str, list[Path]] = {}
     greys_known = reading.meaning.of_greys(folder)[0] is not None
-    found = (p for p in folder.rglob("*") if p.suffix.lower() in (*SUFFIXES, *RECORDS) and p.is_file())
+    found = (p for p in folder.rglob("*") if p.suffix.lower() in (*SUFFIXES, *RECORDS, TABLE) and p.is_file())
     for path in sorted(found, key=lambda p: by_numbers(p.relative_to(folder).as_posix())):
         kind = _kind(path)
+        if kind is None:
+            continue
         if kind == "sealed" and not greys_known:
             raise SceneError(
                 f"{path} is a thermal picture of DJI whose temperatures cannot be read: its sensor values are counts, or not "
@@ -122,7 +126,7 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     if not there:
         raise SceneError(
             f"{folder} holds no thermal image: radiometric JPEG of FLIR or DJI, .fff, .seq, .csq, TIFF or PNG with counts or °C, "
-            "or greys"
+            "tables of °C (.csv), or greys"
         )
     kind, thermal = there[0], kinds[there[0]]
     reading.meaning.check_use(kind, KINDS[kind])
@@ -143,9 +147,11 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     return Recording(frames, notes)
 
 
-def _kind(path: Path) -> str:
+def _kind(path: Path) -> str | None:
     """ "radiometric", "float", "counts", "grey", "colour", or "sealed": a thermal picture whose numbers only its maker's
-    software converts. Raises SceneError for what is no image."""
+    software converts; None for a table of something else. Raises SceneError for what is no image."""
+    if path.suffix.lower() == TABLE:
+        return None if read_temperature_table(path) is None else "float"
     if path.suffix.lower() in RECORDS:
         return "radiometric"
     if path.suffix.lower() in (".jpg", ".jpeg"):
@@ -197,6 +203,11 @@ def _frames_of(
         return
     found = []
     for path in paths:
+        if path.suffix.lower() == TABLE:
+            height, width = read_temperature_table(path).shape
+            load = partial(read_temperature_table, path)
+            found.append(ThermalFrame(frame_name(path, folder), path, 0, load, size=(width, height)))
+            continue
         details, camera = exif_details(read_bytes(path))
         _, size = _mode_and_size(path)
         pages = pages_of(path)

@@ -239,3 +239,15 @@ def test_every_image_of_a_tiff_is_a_frame(tmp_path, kind):
     table.write_text("file,when\nrec.tiff,2024-07-01T10:00:00Z\n")
     with pytest.raises(SceneError, match="line 2: rec.tiff holds 4 frames, .* give each a row, as rec_000000"):
         read_frames(tmp_path, timed)
+
+
+def test_exported_tables_are_frames_and_other_tables_are_none(tmp_path):
+    rows = np.round(np.linspace(15, 40, 18 * 20), 2).reshape(18, 20)
+    for name, shift in (("IR_0001", 0), ("IR_0002", 1)):
+        text = "\n".join(";".join(f"{value + shift:.2f}".replace(".", ",") for value in row) for row in rows)
+        (tmp_path / f"{name}.csv").write_text("Emissivity;0,95\n" + text)
+    (tmp_path / "weather.csv").write_text("time,air_c\n0,12\n")
+    first, second = read_frames(tmp_path)
+    assert (first.name, first.size, first.time) == ("IR_0001", (20, 18), None)
+    np.testing.assert_allclose(first.temperature(), rows, atol=1e-5)
+    np.testing.assert_allclose(second.temperature(), rows + 1, atol=1e-5)
