@@ -73,8 +73,8 @@ LONGEST = (
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config):
-    """One more than there are cores: an eighth of the time is spent waiting for disks, browsers and other processes."""
-    return cores() + 1
+    """A process per core: loading the libraries takes longer than what is waited for."""
+    return cores()
 
 
 def pytest_collection(session):
