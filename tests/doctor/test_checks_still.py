@@ -6,6 +6,7 @@ import pytest
 import torch
 from materials import checks, clean
 
+from heatsplat.contracts import Camera
 from heatsplat.doctor.base import Material
 
 
@@ -23,7 +24,8 @@ def tripod(levels, noise=0.05, frames=12):
 def test_a_tripod_is_told_before_cameras_are_searched_for():
     steady = tripod([0.0] * 12)
     assert checks(steady) == ["still"]
-    assert checks(replace(steady, cameras=[None] * 12, points=None)) == []  # whose poses are known
+    camera = Camera(torch.eye(4), torch.tensor([[50.0, 0, 30], [0, 50.0, 24], [0, 0, 1]]), 60, 48)
+    assert checks(replace(steady, cameras=[camera] * 12)) == []  # whose poses are known
     unknown = steady.images.clone()
     unknown[3, :5] = torch.nan
     assert "still" in checks(replace(steady, images=unknown))
