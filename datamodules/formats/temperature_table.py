@@ -64,26 +64,28 @@ def _tables(lines: list[str], separator: str) -> Iterator[tuple[int, np.ndarray]
         row = _numbers(line, separator)
         if rows and len(row) != len(rows[0]):
             if len(rows) >= MIN_SIDE:
-                yield start, np.stack(rows)
+                yield start, np.array(rows, np.float32)
             rows = []
-        if len(row):
+        if row:
             start = start if rows else number
             rows.append(row)
 
 
-def _numbers(line: str, separator: str) -> np.ndarray:
-    """The numbers [W] float32 of a line; none where it has fewer than ``MIN_SIDE`` or anything else."""
-    cells = [cell.strip().strip('"') for cell in line.split(separator)]
-    if len(cells) > MIN_SIDE and not cells[-1]:  # rows may end, and begin, with a separator
+def _numbers(line: str, separator: str) -> list[float]:
+    """The numbers of a line; none where it has fewer than ``MIN_SIDE`` or anything else."""
+    if separator != ",":
+        line = line.replace(",", ".")
+    cells = line.replace('"', "").split(separator)
+    if len(cells) > MIN_SIDE and not cells[-1].strip():  # rows may end, and begin, with a separator
         cells.pop()
-    if len(cells) > MIN_SIDE and not cells[0]:
+    if len(cells) > MIN_SIDE and not cells[0].strip():
         cells.pop(0)
     if len(cells) < MIN_SIDE or not any(cells):
-        return np.empty(0, np.float32)
+        return []
     try:
-        return np.array([cell.replace(",", ".") or "nan" for cell in cells], dtype=np.float32)
+        return [float(cell or "nan") for cell in cells]
     except ValueError:
-        return np.empty(0, np.float32)
+        return []
 
 
 def _without_counts(table: np.ndarray) -> np.ndarray:

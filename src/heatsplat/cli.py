@@ -179,9 +179,7 @@ def _job(
             if hydra_config.mode == RunMode.MULTIRUN or cause is None:
                 raise
             log.error("%s", sentence(cause))
-            if (
-                "${now:" in OmegaConf.to_container(hydra_config.run, resolve=False)["dir"]
-            ):  # no folder that was there before
+            if "${now:" in OmegaConf.to_container(hydra_config.run, resolve=False)["dir"]:  # it was not there before
                 _remove_unused(output_dir, f"{hydra_config.job.name}.log")
             sys.exit(1)
 

@@ -283,6 +283,11 @@ class View:
     def time_s(self) -> float | None:
         return self.frame.time_s
 
+    @property
+    def counts(self) -> bool:
+        """Whether any of its pixels counts."""
+        return self.mask is None or bool(self.mask.any())
+
     def image(self, modality: str) -> Tensor:
         """The image of a modality ("thermal" or "rgb"), [H, W, C]; "clean" is the thermal image where none is known.
 
@@ -342,17 +347,6 @@ class ViewSet(Sequence[View]):
     @property
     def times_s(self) -> list[float | None]:
         return [frame.time_s for frame in self.frames]
-
-
-METADATA = (
-    "time",
-    "thermal_range",
-    "ambient",
-    "metres",
-    "weather",
-    "labels",
-    "point_features",
-)  # that a scene may have
 
 
 @dataclass(frozen=True)
@@ -467,16 +461,19 @@ class SceneData:
     @property
     def metadata(self) -> frozenset[str]:
         """Names of the metadata that the scene has, in the vocabulary of ``ThermalModel.needs``."""
-        has = (
-            all(t is not None for t in self.train.times_s) and len(self.train) > 0,
-            self.thermal_range is not None,
-            self.ambient_c is not None,
-            self.metres_per_unit is not None,
-            self.weather is not None,
-            self.labels is not None,
-            self.point_features is not None,
-        )
-        return frozenset(name for name, there in zip(METADATA, has, strict=True) if there)
+        return frozenset(name for name, has in METADATA.items() if has(self))
+
+
+# What a scene may have beside its images, and whether one has it.
+METADATA: dict[str, Callable[[SceneData], bool]] = {
+    "time": lambda scene: len(scene.train) > 0 and all(time is not None for time in scene.train.times_s),
+    "thermal_range": lambda scene: scene.thermal_range is not None,
+    "ambient": lambda scene: scene.ambient_c is not None,
+    "metres": lambda scene: scene.metres_per_unit is not None,
+    "weather": lambda scene: scene.weather is not None,
+    "labels": lambda scene: scene.labels is not None,
+    "point_features": lambda scene: scene.point_features is not None,
+}
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ def _pixels(view: View, modality: str) -> Tensor:
 
 def _that_tell(views: ViewSet) -> ViewSet:
     """The views of which pixels count."""
-    return views.subset([i for i, view in enumerate(views) if view.mask is None or bool(view.mask.any())])
+    return views.subset([i for i, view in enumerate(views) if view.counts])
 
 
 def _gathered(module: Any, view: View, maps: Tensor) -> Tensor:

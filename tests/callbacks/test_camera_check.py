@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from heatsplat.callbacks.camera_check import OFF, CameraCheck
-from heatsplat.contracts import Camera, Frame
+from heatsplat.contracts import Camera, Frame, View
 
 FOCAL, DEPTH = 50.0, 2.0
 POINTS = torch.tensor([[x, y, DEPTH] for x in (-0.3, 0.0, 0.3) for y in (-0.2, 0.2)])
@@ -21,14 +21,8 @@ def seen_from(x: float) -> Camera:
     return Camera(viewmat, K, 40, 30)
 
 
-class View:
-    mask = None
-
-    def __init__(self, number: int) -> None:
-        self.frame = Frame(f"{number}.png", number, seen_from(0.01 * number))
-
-    def to(self, device, dtype):
-        return self
+def view(number: int) -> View:
+    return View(Frame(f"{number}.png", number, seen_from(0.01 * number)))
 
 
 class Module:
@@ -41,7 +35,7 @@ class Module:
         self.beside, self.left = beside, left
         self.cameras = SimpleNamespace(learns=learns, of=lambda frame: frame.camera)
         self.schedule = SimpleNamespace(end=steps)
-        self.scene = SimpleNamespace(train=[View(k) for k in range(20)], points=POINTS)
+        self.scene = SimpleNamespace(train=[view(k) for k in range(20)], points=POINTS)
         self.results = SimpleNamespace(run={})
         self.looked: list[int] = []
 
@@ -71,8 +65,8 @@ def test_cameras_that_are_off_are_told_with_the_remedy(caplog):
 
 def test_images_of_which_no_pixel_counts_say_nothing_of_cameras():
     module = Module(beside=0.4, left=0.6)
-    for view in module.scene.train[:-1]:
-        view.mask = torch.zeros(30, 40, dtype=torch.bool)
+    hidden = torch.zeros(30, 40, dtype=torch.bool)
+    module.scene.train = [*(replace(one, mask=hidden) for one in module.scene.train[:-1]), module.scene.train[-1]]
     assert checked(module, views=4)["images"] == 1 and module.looked == [19]
 
 

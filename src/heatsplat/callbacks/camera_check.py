@@ -40,7 +40,7 @@ class CameraCheck(pl.Callback):
         falls, moved = [], []
         for number in evenly_spread(len(module.scene.train), self.views):
             view = module.scene.train[number].to(module.device, module.dtype)
-            if view.mask is not None and not bool(view.mask.any()):  # it fits from anywhere
+            if not view.counts:  # it fits from anywhere
                 continue
             with torch.no_grad():
                 given = module.cameras.of(view.frame)

@@ -72,8 +72,7 @@ class Plateau(pl.Callback):
             return
         view, schedule, step = batch, module.schedule, trainer.global_step
         prediction, image = outputs["prediction"], view.image(module.modality)
-        shown = view.mask is None or bool(view.mask.any())
-        if shown and len(prediction) >= len(image):  # a coarse start tells nothing of full size
+        if view.counts and len(prediction) >= len(image):  # a coarse start tells nothing of full size
             total, visits = self._now.get(view.frame.frame_id, (0.0, 0))
             error = squared_error(prediction, image, view.mask)
             self._now[view.frame.frame_id] = (total + error, visits + 1)

@@ -28,7 +28,7 @@ def noise_of_views(views: ViewSet, modality: str) -> float:
     which no pixel counts tell nothing; of such alone it is ``MIN_NOISE``.
     """
     few = [views[i] for i in evenly_spread(len(views), _NOISY_VIEWS)]
-    few = [view for view in few if view.mask is None or bool(view.mask.any())]
+    few = [view for view in few if view.counts]
     if not few:
         return MIN_NOISE
     images = [view.image(modality)[None, ..., 0].double() for view in few]

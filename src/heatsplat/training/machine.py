@@ -97,9 +97,7 @@ def loading() -> Iterator[None]:
 def clear_away() -> None:
     """Gives the system the memory that earlier jobs of a process have left, which would count as a later job's."""
     gc.collect()
-    with suppress(
-        OSError, AttributeError, TypeError
-    ):  # glibc keeps what is free in between; others have no such function
+    with suppress(OSError, AttributeError, TypeError):  # systems without glibc, which keeps what is free in between
         ctypes.CDLL(None).malloc_trim(0)
 
 
