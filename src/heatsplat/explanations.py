@@ -41,6 +41,8 @@ def explain(error: Exception, command: str, arguments: Sequence[str]) -> str | N
         return _of_composing(error, command, arguments)
     if "group override must be a string" in str(error) and (nulled := _nulled(arguments)):
         return f"{nulled}=null: a group takes the name of one of its options: {', '.join(options_of(nulled))}"
+    if str(error).startswith("Only one of --run, --multirun, --cfg, --info"):  # Hydra's text for a command line
+        return "--cfg and --info show one job: leave out -m, and give each setting one value (seed=0, not seed=0,1)"
     cause = expected(error)
     return None if cause is None else sentence(cause)
 

@@ -47,17 +47,40 @@ def test_a_term_that_is_none_is_absent():
     assert list(Loss({"plain": mean, "edge": None})(at(0))) == ["plain"]
 
 
+def check(terms, steps=100):
+    Loss(terms).check([step / steps for step in range(steps)])
+
+
 def test_steps_at_which_nothing_is_compared_are_refused():
-    Loss({"first": During(mean, stop=0), "second": During(mean, start=0, stop=9)})
-    Loss({"first": During(mean, stop=0), "second": mean})
-    for stop in (0, 4):
-        with pytest.raises(ValueError, match=f"counts at step {stop}; .* first from 0 to {stop}, second from 5 to inf"):
-            Loss({"first": During(mean, stop=stop), "second": During(mean, start=5)})
-    with pytest.raises(ValueError, match="counts at step 4; .* first from 0 to 4, second from 5 to 9"):
+    check({"first": During(mean, stop=0), "second": During(mean, start=0, stop=100)})
+    check({"first": During(mean, stop=0), "second": mean})
+    for stop, first in ((0, "never"), (4, "from 0 to 3")):
+        told = f"counts at step {stop} of 0 to 99; change .* loss.terms: first {first}, second from 5 to 99"
+        with pytest.raises(ValueError, match=told):
+            check({"first": During(mean, stop=stop), "second": During(mean, start=5)})
+    with pytest.raises(ValueError, match="counts at step 4 of 0 to 99; .* first from 0 to 3, second from 5 to 8"):
         within = During(Weighted(OnTargetGrid(During(ByOthersShare(During(mean, stop=9), 0), start=5)), 0.5), start=2)
-        Loss({"first": Weighted(During(mean, stop=4), 2.0), "second": within})
+        check({"first": Weighted(During(mean, stop=4), 2.0), "second": within})
+    with pytest.raises(ValueError, match="counts at step 9 of 0 to 99; .* alone from 0 to 8$"):
+        check({"alone": During(mean, stop=9)})
     with pytest.raises(ValueError, match=r"the loss has no term: give one of loss.terms \(plain\) that is not null"):
         Loss({"plain": None})
+
+
+def test_steps_at_which_weights_are_zero_are_refused():
+    late = Weighted(mean, 1.0, lambda progress: schedules.linear(progress, 0.5, 0.5))
+    check({"late": late, "early": During(mean, stop=50)})
+    with pytest.raises(
+        ValueError, match="no term of the loss counts at step 0 of 0 to 99; .* schedule .*: late from 50 to 99$"
+    ):
+        check({"late": late})
+    with pytest.raises(ValueError, match="at step 0 of .*: off never, late from 50 to 99$"):
+        check({"off": Weighted(mean, 0.0), "late": late})
+
+
+def test_terms_that_are_all_absent_are_told():
+    with pytest.raises(ValueError, match="every term of loss.terms is absent at this step"):
+        summands({}, {})
 
 
 def test_it_is_known_whether_some_term_compares_the_images_of_a_companion():

@@ -397,6 +397,13 @@ def test_flags_may_stand_among_settings():
     assert known == {*cli.ALONE, *cli.WITH_VALUE}
 
 
+def test_a_sweep_whose_configuration_is_asked_for_is_told_to_ask_for_one_job(tmp_path, told):
+    output = told("train", "-m", "method=etgs,3dgs", "--cfg", "job", cwd=tmp_path, code=1)
+    assert (
+        output == "--cfg and --info show one job: leave out -m, and give each setting one value (seed=0, not seed=0,1)"
+    )
+
+
 @pytest.mark.parametrize(
     ("typed", "meant"), [(["--max_steps=7000"], "max_steps=7000 "), (["--seed", "1"], "seed=... "), (["-s"], "s=... ")]
 )

@@ -54,6 +54,8 @@ def test_half_a_degree_is_half_a_degree(root, submission, tmp_path):
     ("spoil", "message"),
     [
         (lambda f: f.unlink(), r"lacks 1 of the 3 held-out views of cooling: near_00003. Render every view of .*transforms_test"),
+        (lambda f: f.rename(f.with_suffix(".png")), r"near_00003.png: .png files are .* no temperatures in °C. Write float32"),
+        (lambda f: [path.rename(path.with_suffix(".PNG")) for path in f.parent.iterdir()], "PNG and 2 more like it: .PNG"),
         (lambda f: write_temperature(f, truth(VIEWS[0])[:, :8]), r"near_00003.tiff is \[12, 8\], its view is \[12, 16\]"),
         (lambda f: write_temperature(f, np.full((12, 16), np.nan)), "has 192 pixels that are NaN or infinite; every pixel"),
         (lambda f: write_temperature(f, truth(VIEWS[0]) + 273.15), r"kelvin, no °C. Subtract 273.15"),

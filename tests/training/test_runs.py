@@ -129,6 +129,15 @@ def test_penalties_inside_the_optimiser_are_logged_beside_the_loss_terms(tmp_pat
     assert logged.value == pytest.approx(1e-5 * gains.square().sum().item() / len(gains), rel=1e-4)
 
 
+def test_a_loss_that_is_absent_at_some_steps_is_refused_before_training(tmp_path):
+    ramp = "{_target_:heatsplat.losses.schedules.linear,_partial_:true,start:0.5,end:0.5}"
+    plain = "{_target_:heatsplat.losses.photometric.Photometric}"
+    late = f"+loss.terms.late={{_target_:heatsplat.losses.compose.Weighted,term:{plain},schedule:{ramp}}}"
+    with pytest.raises(ValueError, match="no term of the loss counts at step 0 of 0 to 3; .* late from 2 to 3"):
+        run(tmp_path, "method=3dgs", *TINY, "max_steps=4", "loss.terms.photometric=null", late)
+    assert not list(tmp_path.glob("checkpoints/*"))
+
+
 def test_density_control_draws_anew_at_every_step(tmp_path, monkeypatch):
     from heatsplat.density.budget import Budget
     from heatsplat.training.rng import generator_for

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -95,11 +95,13 @@ class LossTerm(ABC):
 
     Attributes:
         modality: the companion whose images are compared, such as "rgb"; None where it is the model's own image, or none.
-        span: first step at which the term counts, and the step before which it ends.
     """
 
     modality: str | None = None
-    span: tuple[float, float] = (0, math.inf)
+
+    def counts(self, step: int, progress: float) -> bool:
+        """Whether the term counts at a step of the run, as far as that is known before training."""
+        return True
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
         """Checks and computes, once before training, what it needs of the scene; what the report should say of it, by name."""
@@ -123,9 +125,8 @@ class Wrapped(LossTerm):
     def modality(self) -> str | None:
         return self.term.modality
 
-    @property
-    def span(self) -> tuple[float, float]:
-        return self.term.span
+    def counts(self, step: int, progress: float) -> bool:
+        return self.term.counts(step, progress)
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
         return self.term.prepare(scene, modality)
@@ -154,9 +155,15 @@ class Weighted(Wrapped):
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
         return self.term.prepare(scene, modality) if self.weight != 0.0 else {}
 
+    def counts(self, step: int, progress: float) -> bool:
+        return self._factor(progress) != 0.0 and self.term.counts(step, progress)
+
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
-        factor = self.weight if self.schedule is None else self.weight * self.schedule(inputs.progress)
+        factor = self._factor(inputs.progress)
         return {} if factor == 0.0 else scaled(self.term, inputs, factor)
+
+    def _factor(self, progress: float) -> float:
+        return self.weight if self.schedule is None else self.weight * self.schedule(progress)
 
 
 class During(Wrapped):
@@ -172,10 +179,8 @@ class During(Wrapped):
         super().__init__(term)
         self.start, self.stop = start, math.inf if stop is None else stop
 
-    @property
-    def span(self) -> tuple[float, float]:
-        start, stop = self.term.span
-        return max(start, self.start), min(stop, self.stop)
+    def counts(self, step: int, progress: float) -> bool:
+        return self.start <= step < self.stop and self.term.counts(step, progress)
 
     def __call__(self, inputs: LossInputs) -> Tensor | dict[str, Tensor]:
         return self.term(inputs) if self.start <= inputs.step < self.stop else {}
@@ -188,7 +193,7 @@ class Loss:
         terms: name -> term, or None for a term that is absent.
 
     Raises:
-        ValueError: there is no term, or one is no ``LossTerm``, or none counts at some steps before others do.
+        ValueError: there is no term, or one is no ``LossTerm``.
     """
 
     def __init__(self, terms: Mapping[str, LossTerm | None]) -> None:
@@ -197,12 +202,21 @@ class Loss:
             raise ValueError(f"the loss has no term: give one of loss.terms ({', '.join(terms)}) that is not null")
         for name, term in self.terms.items():
             _check_term(name, term)
-        spans = {name: term.span for name, term in self.terms.items()}
-        last = max(stop for _, stop in spans.values())
-        for step in sorted({0, *(stop for _, stop in spans.values() if stop < last)}):
-            if not any(start <= step < stop for start, stop in spans.values()):
-                told = ", ".join(f"{name} from {start} to {stop}" for name, (start, stop) in spans.items())
-                raise ValueError(f"no term of the loss counts at step {step}; change start or stop: {told}")
+
+    def check(self, progress: Sequence[float]) -> None:
+        """Raises ValueError where no term counts at some step of a run; ``progress`` is that at each of its steps."""
+        moments = list(enumerate(progress))
+        for step, share in moments:
+            if any(term.counts(step, share) for term in self.terms.values()):
+                continue
+            told = []
+            for name, term in self.terms.items():
+                steps = [at for at, done in moments if term.counts(at, done)]
+                told.append(f"{name} from {steps[0]} to {steps[-1]}" if steps else f"{name} never")
+            raise ValueError(
+                f"no term of the loss counts at step {step} of 0 to {moments[-1][0]}; change start, stop, weight or schedule in "
+                f"loss.terms: {', '.join(told)}"
+            )
 
     def prepare(self, scene: SceneData, modality: str) -> dict[str, str]:
         """Lets terms check and compute what they need of a scene; what the report should say of them, by name."""
@@ -228,7 +242,7 @@ def summands(*parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The terms of several parts of a run by name, scalars whose sum is minimised.
 
     Raises:
-        ValueError: two are called the same, or one is no scalar tensor; the message names it.
+        ValueError: two are called the same, or one is no scalar tensor; the message names it. Or there is none.
     """
     terms: dict[str, Tensor] = {}
     for part in parts:
@@ -240,6 +254,10 @@ def summands(*parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
                 )
             _check_scalar(f"loss term '{name}'", value)
             terms[name] = value
+    if not terms:
+        raise ValueError(
+            "every term of loss.terms is absent at this step, so nothing is minimised: add one that counts"
+        )
     return terms
 
 

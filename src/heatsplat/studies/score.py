@@ -69,6 +69,12 @@ def score_scene(handed_in: Path, scene: Path, truth: Path, scores: Sequence[str]
     names = sorted(path.stem for path in truth.glob("*.tiff"))
     files = {name: _file(handed_in, name) for name in names}
     if missing := [name for name, file in files.items() if file is None]:
+        if others := [path for path in sorted(handed_in.glob("*.*")) if path.stem in missing]:
+            more = f" and {len(others) - 1} more like it" if len(others) > 1 else ""
+            raise SceneError(
+                f"{others[0]}{more}: {others[0].suffix} files are not scored, and pictures hold no temperatures in °C. Write "
+                f"float32 temperatures in °C, one channel, to {handed_in}/<view>.tiff (or .npy)"
+            )
         more = f" and {len(missing) - 5} more" if len(missing) > 5 else ""
         raise SceneError(
             f"{handed_in} lacks {len(missing)} of the {len(names)} held-out views of {scene.name}: "

@@ -137,6 +137,7 @@ class SplatTraining(SceneModel):
             for name in self.thermal.companions:
                 if not self.loss.compares(name):
                     log.warning("no term of loss.terms compares %s images: they are scored, but not learned", name)
+            self.loss.check([self.schedule.progress(step) for step in range(self.schedule.steps)])
             self.results.data |= self.loss.prepare(self.scene, self.modality)
             self.trainer.val_check_interval = self._between_resets(self.trainer.val_check_interval)
 
