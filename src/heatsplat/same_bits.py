@@ -11,7 +11,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+
+from heatsplat.derivatives import once_differentiable
 
 PIECE = 32768  # numbers that torch leaves to one thread
 ROW = 4096  # numbers, less than a piece

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from heatsplat.derivatives import once_differentiable
 from heatsplat.kernels import hash_grid as kernel
 
 # π_2 and π_3 of Eq. 4 as int32; products and the exclusive or wrap around as those of uint32 do.

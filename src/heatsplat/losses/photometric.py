@@ -11,9 +11,9 @@ from functools import lru_cache
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from heatsplat.derivatives import once_differentiable
 from heatsplat.kernels import gpu
 from heatsplat.kernels import ssim as kernel
 from heatsplat.losses.compose import LossInputs, LossTerm

@@ -50,8 +50,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from heatsplat.derivatives import once_differentiable
 from heatsplat.physics.responses import (
     ResponseTable,
     SemiInfiniteTable,

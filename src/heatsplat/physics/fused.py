@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from heatsplat.derivatives import once_differentiable
 from heatsplat.kernels import gpu
 from heatsplat.kernels import relaxation as kernels
 from heatsplat.kernels.simd import LANES

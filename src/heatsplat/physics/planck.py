@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+
+from heatsplat.derivatives import once_differentiable
 
 FIRST_RADIATION = 1.191042972397188e-16  # W m²/sr, 2 h c²
 SECOND_RADIATION = 0.014387768775039337  # m K, h c/k

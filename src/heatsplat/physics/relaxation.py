@@ -25,7 +25,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+
+from heatsplat.derivatives import once_differentiable
 
 BACKWARD_TIME_CONSTANTS = 1.0  # how far e^{-at} is extrapolated to t < 0, in time constants
 

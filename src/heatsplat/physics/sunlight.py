@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from heatsplat.derivatives import once_differentiable
 from heatsplat.kernels import heat_balance as kernels
 from heatsplat.physics.responses import cubics, driver_means, grid_position, interval_of, log_rate_grid, step_weights
 

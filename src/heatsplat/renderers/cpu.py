@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from heatsplat.contracts import RenderOutput, WeightedSums
+from heatsplat.derivatives import once_differentiable
 from heatsplat.kernels import binning, compositing, projection
 from heatsplat.kernels.buffers import Buffers
 from heatsplat.kernels.constants import BLOCKS, CHUNK, RANK, SCREEN, SUMS, TILE

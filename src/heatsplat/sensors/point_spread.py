@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from heatsplat.contracts import Frame, SceneData
+from heatsplat.derivatives import once_differentiable
 from heatsplat.same_bits import total
 from heatsplat.sensors.base import SensorPart, nonnegative_tanh
 
@@ -78,6 +79,7 @@ class _Blur(torch.autograd.Function):
         return _convolved(_convolved(image, weights, 0), weights, 1)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         image, weights = ctx.saved_tensors
         grad_image = grad_variance = None

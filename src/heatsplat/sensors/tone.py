@@ -7,10 +7,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from heatsplat.contracts import Frame
+from heatsplat.derivatives import once_differentiable
 from heatsplat.kernels import tone as kernel
 from heatsplat.sensors.base import SensorPart
 

@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from heatsplat.contracts import SceneData
+from heatsplat.derivatives import once_differentiable
 from heatsplat.geometry.neighbours import neighbour_pairs
 from heatsplat.same_bits import PIECE, total
 from heatsplat.splats import Splats

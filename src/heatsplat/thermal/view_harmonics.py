@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from heatsplat.derivatives import once_differentiable
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.kernels import spherical_harmonics as kernel
 from heatsplat.thermal.base import Query
