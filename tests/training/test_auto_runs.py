@@ -10,12 +10,14 @@ from running import BARE, TINY, run
 
 from heatsplat.composition import build, compose
 from heatsplat.contracts import SceneError
+from heatsplat.doctor.base import Finding
 from heatsplat.effects import assembly
 from heatsplat.effects.base import Verdict
 from heatsplat.io.results import RunResults
 from heatsplat.runs.checks import checked
 from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import resumed
+from heatsplat.runs.run import train_in
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.session import restore
 
@@ -39,6 +41,20 @@ def scene_says(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "heatsplat.effects.catalogue", SimpleNamespace(decide=decide))
     return asked
+
+
+def test_what_is_wrong_with_a_scene_is_told_before_its_effects_are_looked_for(scene_says, tmp_path, monkeypatch):
+    told = []
+    finding = Finding("conventions", 1.5, "Poses look turned.", "Convert them")
+
+    def warn_of(scene):
+        told.append(len(scene_says))
+        return [finding]
+
+    monkeypatch.setattr("heatsplat.runs.run.warn_of", warn_of)
+    train_in(compose([*BARE, *LEAST, "method=auto", "effects.price=false", "max_steps=1"]), tmp_path)
+    assert told == [0] and len(scene_says) == 1
+    assert json.loads((tmp_path / "doctor.json").read_text())[0]["check"] == "conventions"
 
 
 def test_a_run_simulates_what_the_scene_calls_for_and_says_why_and_for_how_much(scene_says, tmp_path):

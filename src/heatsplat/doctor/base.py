@@ -194,11 +194,14 @@ class Check:
         name: in findings and docs.
         summary: what is looked at, in a sentence.
         find: what is wrong with a recording; empty where nothing is or where it cannot be told.
+        discredits: what of a ``Material`` the other checks do not look at where this one finds something, as what it says then
+            is no finding of its own.
     """
 
     name: str
     summary: str
     find: Callable[[Material], list[Finding]]
+    discredits: tuple[str, ...] = ()
 
 
 def material_of(scene: SceneData) -> Material:

@@ -16,16 +16,16 @@ from rich.table import Table
 from heatsplat.contracts import SceneData
 from heatsplat.doctor import checks
 from heatsplat.doctor.base import Check, Finding, Material, material_of
-from heatsplat.doctor.checks import conventions
 from heatsplat.io.files import write_atomically
 
 log = logging.getLogger("heatsplat")
 
 FINDINGS_FILE = "doctor.json"
 
+NAMES = sorted(module.name for module in iter_modules(checks.__path__))
+# By name, and first those that decide what the others may look at.
 CHECKS: tuple[Check, ...] = tuple(
-    import_module(f"{checks.__name__}.{name}").CHECK
-    for name in sorted(module.name for module in iter_modules(checks.__path__))
+    sorted((import_module(f"{checks.__name__}.{name}").CHECK for name in NAMES), key=lambda check: not check.discredits)
 )
 
 
@@ -33,10 +33,12 @@ def examine(material: Material) -> list[Finding]:
     """What is wrong, the most costly first; empty where nothing is."""
     if not len(material.images):
         return []
-    found = conventions.CHECK.find(material)
-    # What misread poses say of points, and points of images, is no finding of its own.
-    seen = replace(material, points=None) if found else material
-    found += [finding for check in CHECKS if check is not conventions.CHECK for finding in check.find(seen)]
+    found = []
+    for check in CHECKS:
+        told = check.find(material)
+        found += told
+        if told and check.discredits:
+            material = replace(material, **dict.fromkeys(check.discredits))
     return sorted(found, key=lambda finding: -finding.cost)
 
 

@@ -90,19 +90,31 @@ def train_in(config: dict[str, Any], output_dir: Path) -> RunResults:
     if results is not None:
         log.info("%s has results already; skipped. Delete the folder to run it again.", output_dir)
         return results
-    run = begin(config, output_dir)
-    if run.config["doctor"] and run.config["ckpt"] is None and (found := warn_of(run.data.scene)):
+    composed, config, data = _opened(config, output_dir)
+    # Before the search for effects, which takes minutes; written down once nothing refuses the run any more.
+    found = warn_of(data.scene) if config["doctor"] and config["ckpt"] is None else []
+    run = _planned(composed, config, data, output_dir)
+    if found:
         write_findings(found, output_dir / FINDINGS_FILE)
     return fit(run.module, run.data, run.trainer, ckpt=run.config["ckpt"], test=run.config["test"])
 
 
 def begin(config: dict[str, Any], output_dir: Path) -> Run:
     """A run that is ready to train."""
+    return _planned(*_opened(config, output_dir), output_dir)
+
+
+def _opened(config: dict[str, Any], output_dir: Path) -> tuple[dict[str, Any], dict[str, Any], Any]:
+    """A configuration as it was composed and as it goes on, and the data that it names."""
     prepare_machine(config["threads"])
-    config = composed = checked(config)
-    config = resumed(config, output_dir)
+    composed = checked(config)
+    config = resumed(composed, output_dir)
     data = build(config["data"])
-    config = on_scene(config, data.scene)
+    return composed, on_scene(config, data.scene), data
+
+
+def _planned(composed: dict[str, Any], config: dict[str, Any], data: Any, output_dir: Path) -> Run:
+    """The run that an opened configuration describes, with what its scene decides."""
     config = decided(config, data.scene)
     config = budgeted(config, data.scene)
     check_last_stage(config)

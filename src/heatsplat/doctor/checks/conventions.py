@@ -192,4 +192,9 @@ def _seen(material: Material) -> dict[str, tuple[float, float]]:
     return found
 
 
-CHECK = Check("conventions", "whether poses fit images and points better under another convention", find)
+CHECK = Check(
+    "conventions",
+    "whether poses fit images and points better under another convention",
+    find,
+    discredits=("points",),  # which misread poses put into wrong images
+)
