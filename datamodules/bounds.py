@@ -8,7 +8,7 @@ from typing import Any
 
 from heatsplat.contracts import SceneError, ThermalRange
 from heatsplat.datamodules.side_files import finite, json_object
-from heatsplat.physics.units import KELVIN_AT_0_C
+from heatsplat.physics.units import KELVIN_AT_0_C, says_fahrenheit
 
 BOUNDS_FILE = "temperature_bounds.json"
 # °C that a camera can read: from absolute zero to beyond any thermal camera.
@@ -24,7 +24,13 @@ def celsius(value: Any, where: str) -> float:
 
 
 def celsius_in(values: Mapping[str, Any], key: str, path: Path) -> float:
-    """The temperature under ``key``. Raises SceneError naming file and key when it is missing or none."""
+    """The temperature under ``key``. Raises SceneError naming file and key when it is missing or none, or in °F."""
+    for name, unit in values.items():
+        if "unit" in name.lower() and isinstance(unit, str) and says_fahrenheit(f"unit: {unit}"):
+            raise SceneError(
+                f"{path}: {name!r} is {unit!r}, and temperatures are read in °C: write (F - 32) / 1.8 for each, and leave "
+                f"{name!r} out"
+            )
     if key not in values:
         raise SceneError(f"{path} has no key {key!r}; it has {', '.join(values) or 'none'}")
     return celsius(values[key], f"{path}: {key!r}")

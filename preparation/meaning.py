@@ -11,10 +11,11 @@ import numpy as np
 from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.dji import PER_KELVIN
+from heatsplat.datamodules.formats.images import tiff_text
 from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.physics.planck import Band
 from heatsplat.physics.radiometry import BandResponse, PlanckResponse
-from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, USUAL_MEDIAN_C, is_centikelvin
+from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, USUAL_MEDIAN_C, is_centikelvin, says_fahrenheit
 
 # °C per count of other cameras that store kelvin; nothing in a file tells them apart, so they are named and asked for.
 OTHERS = {
@@ -127,12 +128,21 @@ class Meaning:
         )
 
     def of_floats(self, sample: np.ndarray, path: Path) -> tuple[Calibration, str]:
-        """The calibration of floating-point images and a sentence about it. Raises SceneError where they may be kelvin."""
+        """The calibration of floating-point images and a sentence about it.
+
+        Raises:
+            SceneError: nothing was said, and they may be kelvin, or the file says that they are °F.
+        """
         if self.scale is not None or self.offset_c is not None:
             scale = 1.0 if self.scale is None else self.scale
             # A scale alone is one of kelvin, as of counts.
             offset = -KELVIN_AT_0_C if self.offset_c is None else self.offset_c
             return self.of_temperatures(scale, offset), f"floats: °C = {scale:g} * value {offset:+g}"
+        if says_fahrenheit(tiff_text(path)):
+            raise SceneError(
+                f"{path} says that its numbers are °F: give counts.scale={1 / 1.8:.6f} counts.offset_c={-32 / 1.8:.4f}, or "
+                "counts.offset_c=0 where they are °C all the same"
+            )
         finite = sample[np.isfinite(sample)]
         if finite.size and MAYBE_KELVIN[0] < np.median(finite) < MAYBE_KELVIN[1]:
             raise SceneError(

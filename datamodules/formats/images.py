@@ -9,6 +9,7 @@ from typing import BinaryIO
 
 import cv2
 import numpy as np
+from PIL.TiffImagePlugin import IMAGEDESCRIPTION, ImageFileDirectory_v2
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.lens import Lens, undistortion_maps
@@ -20,6 +21,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 # Kind of a page of a TIFF (1: a smaller copy, 4: a mask), its width, height, bits of a sample, samples of a pixel, their type.
 PAGE_TAGS = (254, 256, 257, 258, 277, 339)
+GDAL_METADATA = 42112  # tag in which GDAL writes the unit of a band
 MOST_ENTRIES = 4096  # of a page; more are damage
 
 # Mean difference between the largest and smallest channel of a pixel, in 8-bit grey levels. Greys stored as RGB have 0,
@@ -95,6 +97,19 @@ def pages_of(path: Path) -> list[int]:
         if len(found) > 1:  # of a damaged file with one image decoding says what it is worth
             raise SceneError(f"image {path} is corrupt after its image {len(found)}; copy it again") from error
     return [i for i, page in enumerate(found) if page == found[0]] or [0]
+
+
+def tiff_text(path: Path) -> str:
+    """What a TIFF says of its first image in words; empty where it says nothing, or is no TIFF that can be read."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(8)
+            tags = ImageFileDirectory_v2(head + file.read(8) if head[2:3] == b"+" else head)  # BigTIFF has a longer one
+            file.seek(tags.next)
+            tags.load(file)
+            return "\n".join(str(tags[tag]) for tag in (IMAGEDESCRIPTION, GDAL_METADATA) if tag in tags)
+    except Exception:  # Pillow raises whatever a damaged file leads to; decoding says what it is worth
+        return ""
 
 
 def _tiff_pages(file: BinaryIO) -> Iterator[tuple]:

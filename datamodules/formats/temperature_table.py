@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from heatsplat.contracts import SceneError
+from heatsplat.physics.units import says_fahrenheit
 
 SUFFIX = ".csv"
 MIN_SIDE = 16  # pixels: smaller tables are no images
 SEPARATORS = ("\t", ";", ",")
-# Where programs name the unit, beside the table.
-FAHRENHEIT = re.compile(r"°\s*F\b|\bdeg(?:rees?)?\s*F\b|\bfahrenheit\b", re.IGNORECASE)
 
 
 def read_temperature_table(path: Path) -> np.ndarray | None:
@@ -37,7 +35,7 @@ def read_temperature_table(path: Path) -> np.ndarray | None:
     if sum(other.shape == table.shape for _, other in tables) > 1:
         raise SceneError(f"{path} holds several images as tables: export each into a file of its own")
     around = lines[:first] + lines[first + len(table) :]
-    if any(FAHRENHEIT.search(line) for line in around):
+    if any(says_fahrenheit(line) for line in around):
         raise SceneError(
             f"{path} says that its temperatures are °F: export them in °C, or write (F - 32) / 1.8 for each"
         )

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from layouts import write_image
 from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.images import (
@@ -13,8 +14,20 @@ from heatsplat.datamodules.formats.images import (
     resized,
     resized_mask,
     split_alpha,
+    tiff_text,
     to_grey,
 )
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_a_tiff_says_what_it_is_in_words(tmp_path, big):
+    tags = ImageFileDirectory_v2()
+    tags[270], tags[42112] = "Units: deg F", "<GDALMetadata/>"
+    Image.fromarray(np.zeros((4, 5), np.float32)).save(tmp_path / "a.tiff", tiffinfo=tags, big_tiff=big)
+    assert tiff_text(tmp_path / "a.tiff") == "Units: deg F\n<GDALMetadata/>"
+    (tmp_path / "b.tiff").write_bytes((tmp_path / "a.tiff").read_bytes()[:20])
+    write_image(tmp_path / "c.png", np.zeros((4, 5), np.uint8))
+    assert [tiff_text(tmp_path / name) for name in ("b.tiff", "c.png", "d.tiff")] == ["", "", ""]
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -1,8 +1,11 @@
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from heatsplat.contracts import SceneError
 from heatsplat.preparation.meaning import Meaning
@@ -49,6 +52,17 @@ def test_floats_are_celsius_unless_they_may_be_kelvin():
     assert celsius(said, [293.15]) == pytest.approx([20.0])
 
 
+def test_floats_whose_file_says_fahrenheit_are_asked_about(tmp_path):
+    pixels, tags = np.full((4, 5), 70.0, np.float32), ImageFileDirectory_v2()
+    tags[270] = '{"unit": "F"}'
+    Image.fromarray(pixels).save(tmp_path / "a.tiff", tiffinfo=tags)
+    with pytest.raises(SceneError, match="a.tiff says .* °F: give counts.scale=0.555556 counts.offset_c=-17.7778, or"):
+        Meaning().of_floats(pixels, tmp_path / "a.tiff")
+    told = Meaning(scale=0.555556, offset_c=-17.7778).of_floats(pixels, tmp_path / "a.tiff")[0]
+    assert celsius(told, [70.0]) == pytest.approx([21.11], abs=0.01)
+    assert Meaning(offset_c=0.0).of_floats(pixels, tmp_path / "a.tiff")[1].startswith("floats: °C = 1 * value")
+
+
 def test_greys_have_temperatures_where_there_are_bounds(tmp_path):
     assert Meaning().of_greys(tmp_path)[0] is None
     assert celsius(Meaning(bounds_c=[10, 40]).of_greys(tmp_path)[0], [0.0, 255.0]) == pytest.approx([10.0, 40.0])
@@ -56,6 +70,18 @@ def test_greys_have_temperatures_where_there_are_bounds(tmp_path):
     (tmp_path / "temperature_bounds.json").write_text('{"absolute_min_temperature": 0, "absolute_max_temperature": 51}')
     found, note = Meaning().of_greys(tmp_path / "images")
     assert celsius(found, [100.0]) == pytest.approx([20.0]) and "temperature_bounds.json" in note
+
+
+@pytest.mark.parametrize("unit", ["F", "degF", "Fahrenheit"])
+def test_bounds_in_fahrenheit_are_refused(tmp_path, unit):
+    bounds = {"absolute_min_temperature": 32, "absolute_max_temperature": 212, "Unit": unit}
+    (tmp_path / "temperature_bounds.json").write_text(json.dumps(bounds))
+    with pytest.raises(
+        SceneError, match=rf"bounds.json: 'Unit' is '{unit}', and temperatures are read in °C: write \(F - 32\)"
+    ):
+        Meaning().of_greys(tmp_path)
+    (tmp_path / "temperature_bounds.json").write_text(json.dumps(bounds | {"Unit": "C"}))
+    assert "32 .. 212 °C" in Meaning().of_greys(tmp_path)[1]
 
 
 @pytest.mark.parametrize(
