@@ -251,3 +251,36 @@ def test_exported_tables_are_frames_and_other_tables_are_none(tmp_path):
     assert (first.name, first.size, first.time) == ("IR_0001", (20, 18), None)
     np.testing.assert_allclose(first.temperature(), rows, atol=1e-5)
     np.testing.assert_allclose(second.temperature(), rows + 1, atol=1e-5)
+
+
+def previews(colour_map, size=1):
+    """A table of temperatures in two frames, and pictures of them by a colour map, or in greys for None."""
+    y, x = np.mgrid[:18, :20]
+    for frame, shift in (("IR_0001", 0.0), ("IR_0002", 4.0)):
+        values = 20 + 8 * np.sin(0.4 * x + shift) + 6 * np.cos(0.3 * y)
+        grey = np.clip((values - 6) / 28 * 255, 0, 255).astype(np.uint8).repeat(size, 0).repeat(size, 1)
+        picture = np.stack([grey] * 3, 2) if colour_map is None else cv2.applyColorMap(grey, colour_map)[..., ::-1]
+        yield frame, values.astype(np.float32), picture
+
+
+@pytest.mark.parametrize(("colour_map", "size"), [(cv2.COLORMAP_INFERNO, 1), (cv2.COLORMAP_JET, 4), (None, 1)])
+def test_pictures_of_the_temperatures_are_no_photos(tmp_path, colour_map, size):
+    for name, values, picture in previews(colour_map, size):
+        (tmp_path / f"{name}.csv").write_text("\n".join(";".join(f"{value:.3f}" for value in row) for row in values))
+        write_images(tmp_path, {f"{name}.png": picture})
+    found = read_recording(tmp_path)
+    assert [frame.rgb for frame in found.frames] == [None, None]
+    assert "2 pictures such as IR_0001.png show the temperatures themselves in greys or colours" in " ".join(
+        found.notes
+    )
+    photo = np.random.default_rng(0).integers(0, 255, (36, 40, 3), np.uint8)
+    write_images(tmp_path, {f"IR_000{i}_V.jpg": photo for i in (1, 2)})
+    assert [frame.rgb.name for frame in read_frames(tmp_path)] == ["IR_0001_V.jpg", "IR_0002_V.jpg"]
+
+
+def test_photos_that_temperatures_explain_in_part_are_photos(tmp_path):
+    for name, values, picture in previews(cv2.COLORMAP_INFERNO):
+        picture = picture.copy()
+        picture[:, 12:] = np.random.default_rng(0).integers(0, 255, (18, 8, 3), np.uint8)
+        write_images(tmp_path, {f"{name}.tiff": values, f"{name}.png": picture})
+    assert [frame.rgb.name for frame in read_frames(tmp_path)] == ["IR_0001.png", "IR_0002.png"]
