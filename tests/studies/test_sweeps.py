@@ -13,7 +13,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from running import NO_PICTURES, compose_run
 
 from heatsplat.contracts import SceneError
-from heatsplat.io.results import FAILED, METRICS_FILE
+from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 from heatsplat.runs.resume import NOT_LEARNED
 from heatsplat.studies.finished import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, read_runs, row_names, settings_of
 from heatsplat.studies.published.figures import quoted
@@ -66,6 +66,28 @@ def test_the_table_is_written_for_people_programs_and_eyes(sweep):
         and rows[0]["paper_psnr"] == "40.68"
         and rows[1]["paper_psnr"] == ""
         and rows[2]["failed"] == "1"
+    )
+
+
+def test_own_scores_are_columns_with_their_units(sweep):
+    for number, rmse, name in ((0, 0.51234, "rmse_c"), (2, 0.41234, "rmse_c"), (1, 1234.5, "steps_seen")):
+        (path,) = sweep.glob(f"*_{number}_x/{METRICS_FILE}")
+        results = RunResults.read(path)
+        results.put("test", name, rmse)
+        results.put("test", "none_at_all", None, "nothing was seen")
+        if name == "rmse_c":
+            results.definitions[name] = "°C, lower is better: root of the mean square error"
+        results.write(path)
+    write_sweep(sweep)
+    text = (sweep / "table.md").read_text()
+    assert "| PSNR (dB) | MAE (°C) | rmse_c (°C) | steps_seen | train (s) |" in text and "none_at_all" not in text
+    assert "| 0.4623 ± 0.0707 | – |" in text and "| – | 1,234 |" in text
+    with open(sweep / "table.csv", newline="") as file:
+        first, second, *_ = csv.DictReader(file)
+    assert (
+        float(first["rmse_c"]) == pytest.approx(0.46234)
+        and first["steps_seen"] == ""
+        and second["steps_seen"] == "1234.5"
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from itertools import chain, zip_longest
 from pathlib import Path
@@ -20,7 +19,7 @@ from heatsplat.io.page import plain
 from heatsplat.io.quantities import CLOCKS, Clock, moment
 from heatsplat.io.results import CURVE_FILE, RunResults
 from heatsplat.io.tables import NONE, markdown_table, read_csv
-from heatsplat.metrics.definitions import described
+from heatsplat.metrics.definitions import described, unit_of
 from heatsplat.viewer.page import FILE as VIEWER_FILE
 
 DEFINITIONS_TITLE = "Definitions of the scores"
@@ -195,8 +194,8 @@ def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:
     """Names and values of "test" or "cost" with their units, for a table; a dash for what could not be had."""
     cells = []
     for name, value in content[section].items():
-        own = re.match(r"(\S+), (?:lower|higher) is better", str(content.get("definitions", {}).get(name, "")))
-        unit = quantity.unit if (quantity := described(name)) is not None else own[1] if own else ""
+        quantity = described(name)
+        unit = quantity.unit if quantity is not None else unit_of(content.get("definitions", {}).get(name))
         cells.append((name, NONE if value is None else f"{_number(value)} {unit}".rstrip()))
     return cells
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 
 OUTLIER_C = 10.0  # SupIR-GS drops pixels with a larger error
@@ -107,3 +108,9 @@ def described(name: str) -> Definition | Cost | None:
     if score not in DEFINITIONS:
         return None
     return replace(DEFINITIONS[score], title=f"{'RGB' if image == 'rgb' else image} {DEFINITIONS[score].title}")
+
+
+def unit_of(definition: object) -> str:
+    """The unit with which what metrics.json says of a score begins ("°C, lower is better: ..."); empty for none."""
+    found = re.match(r"(\S+), (?:lower|higher) is better", str(definition))
+    return found[1] if found else ""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, literal, series_look, write_png
 from heatsplat.io.tables import NONE, markdown_table, over_seeds, write_csv
-from heatsplat.metrics.definitions import described
+from heatsplat.metrics.definitions import described, unit_of
 from heatsplat.studies.child_runs import all_rows
 from heatsplat.studies.finished import Runs, read_runs, row_names, settings_of
 from heatsplat.studies.recorded import OVERRIDES
@@ -21,10 +22,17 @@ log = logging.getLogger(__name__)
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
 # Scores and costs in the table, where any job has them.
-COLUMNS = (
-    "psnr", "ssim", "lpips", "mae_c", "clean_psnr", "clean_mae_c", "rgb_psnr",
-    "train_seconds", "peak_memory_mb", "gaussians", "render_fps",
-)  # fmt: skip
+SCORES = (
+    "psnr",
+    "ssim",
+    "lpips",
+    "mae_c",
+    "clean_psnr",
+    "clean_mae_c",
+    "rgb_psnr",
+)  # and after them those of own callbacks
+COSTS = ("train_seconds", "peak_memory_mb", "gaussians", "render_fps")
+OWN_DIGITS = 4  # significant ones of the largest value of an own score
 
 Printed = Mapping[str, Mapping[str, str]]  # name of a row -> score or cost -> what a paper prints for it
 
@@ -81,12 +89,30 @@ def _number(job: Path) -> tuple[int, str]:
     return (numbers[-1] if numbers else 0, job.name)
 
 
-def _columns(rows: Iterable[Runs]) -> list[str]:
-    return [name for name in COLUMNS if any(row.values(name) for row in rows)]
+def _columns(rows: Sequence[Runs]) -> list[str]:
+    own = dict.fromkeys(
+        name
+        for row in rows
+        for found in row.table["results"].dropna()
+        for name in found.test
+        if described(name) is None
+    )
+    return [name for name in (*SCORES, *own, *COSTS) if any(row.values(name) for row in rows)]
 
 
 def _printed(paper: Printed) -> list[str]:
-    return [name for name in COLUMNS if any(name in texts for texts in paper.values())]
+    return [name for name in (*SCORES, *COSTS) if any(name in texts for texts in paper.values())]
+
+
+def _shown(name: str, rows: Sequence[Runs]) -> tuple[str, int]:
+    """Heading of a column, and digits behind the point of its numbers."""
+    if known := described(name):
+        return known.heading, known.digits
+    told = (found.definitions.get(name) for row in rows for found in row.table["results"].dropna())
+    unit = next(filter(None, map(unit_of, told)), "")
+    largest = max(abs(value) for row in rows for value in row.values(name))
+    digits = OWN_DIGITS - 1 - math.floor(math.log10(largest)) if largest else 0
+    return f"{name} ({unit})" if unit else name, max(digits, 0)
 
 
 def markdown(rows: Sequence[Runs], paper: Printed) -> str:
@@ -94,14 +120,15 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
     columns = _columns(rows)
     printed = _printed(paper)
     several = len({row.scene for row in rows}) > 1
-    head = [*(["scene"] if several else []), "row", "runs", *(described(name).heading for name in columns)]
+    shown = {name: _shown(name, rows) for name in columns}
+    head = [*(["scene"] if several else []), "row", "runs", *(heading for heading, _ in shown.values())]
     head += [f"paper: {described(name).heading}" for name in printed]
     cells = [
         [
             *([row.scene] if several else []),
             row.label,
             row.count,
-            *(over_seeds(row.values(name), described(name).digits) for name in columns),
+            *(over_seeds(row.values(name), digits) for name, (_, digits) in shown.items()),
             *(paper.get(row.name, {}).get(name, NONE) for name in printed),
         ]
         for row in rows
