@@ -114,6 +114,18 @@ def test_a_figure_names_the_view_its_moment_and_the_clock(tmp_path):
     assert "render · 100 % above 5 °C" in svg
 
 
+def test_pictures_of_greys_without_temperatures_say_so_at_their_bar(tmp_path, monkeypatch):
+    scene = replace(make_scene(), thermal_range=None)
+    frames = shot_frames(scene, "view", None, 0, 1)
+    image = torch.full((frames[0].camera.height, frames[0].camera.width, 1), 0.5)
+    shown = []
+    monkeypatch.setattr(ShotFiles, "add_picture", lambda self, suffix, stem, panel, *_, **__: shown.append(panel))
+    for ends in (None, [10.0, 40.0]):
+        write_shot([({"recorded": image}, None)], frames, scene, ShotFiles(tmp_path, video=False), range_c=ends)
+    assert [panel.bar.unit for panel in shown] == ["image value"] * 2
+    assert shown[1].title.endswith("100 % below 10 image value")
+
+
 def test_limits_stand_before_the_title_which_narrow_panels_cut(tmp_path, monkeypatch):
     scene = make_scene()
     frames = shot_frames(scene, "view", scene.train.times_s[-1] + 3600.0, 0, 1)

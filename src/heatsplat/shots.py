@@ -16,7 +16,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_count, check_numbers, check_option
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
-from heatsplat.io.pictures import Bar, Panel, compose, image_panel, write_figure, write_png
+from heatsplat.io.pictures import Bar, Panel, bar_unit, compose, image_panel, write_figure, write_png
 from heatsplat.io.quantities import clock_of, moment
 from heatsplat.io.tiff import write_temperature
 from heatsplat.io.video import video as film
@@ -285,7 +285,7 @@ def write_shot(
     if bounds is None:
         log.warning("scene '%s' has no temperature bounds: files hold image values in [0, 1], not °C", scene.name)
     low, high = range_c or ((bounds.min_c, bounds.max_c) if bounds else (0.0, 1.0))
-    bar = Bar(low, high, "°C" if bounds else "")
+    bar = Bar(low, high, bar_unit(bounds))
     stems = _stems([frame.name for frame in frames])
     clock = clock_of(scene)
     rows: list[tuple[str, float | None, float, float]] = []

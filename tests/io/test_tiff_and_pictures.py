@@ -96,6 +96,16 @@ def test_the_picture_holds_the_image_and_the_bar():
     assert longer.shape == picture.shape  # frames of a video must not change their size with their title
 
 
+def test_bars_of_thermal_images_say_whether_they_are_temperatures():
+    grey, colour = torch.full((8, 8, 1), 0.5), torch.full((8, 8, 3), 0.5)
+
+    def units(image, bounds):
+        return [panel.bar and panel.bar.unit for panel in comparison_panels(image, image, bounds)]
+
+    assert units(grey, RANGE) == [None, "°C", "°C"] and units(grey, None) == [None, "image value", "image value"]
+    assert units(colour, RANGE) == units(colour, None) == [None, None, ""]
+
+
 def test_comparison_shows_signed_errors_in_celsius():
     target = torch.full((65, 40, 1), 0.25)
     target[:, :20] = 0.5

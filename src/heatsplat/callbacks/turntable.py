@@ -8,7 +8,7 @@ import pytorch_lightning as pl
 from PIL import Image
 
 from heatsplat.callbacks.images import scene_bounds
-from heatsplat.io.pictures import Bar, compose, image_panel
+from heatsplat.io.pictures import Bar, bar_unit, compose, image_panel
 from heatsplat.io.quantities import clock_of, moment
 from heatsplat.shots import shot_frames
 
@@ -36,7 +36,7 @@ class Turntable(pl.Callback):
             frames = shot_frames(scene, "orbit", count=self.frames)
         except ValueError:  # all cameras on one line of sight
             frames = shot_frames(scene, "path", count=self.frames)
-        bar = Bar(*scene_bounds(scene, module.modality), "" if known is None else "°C")
+        bar = Bar(*scene_bounds(scene, module.modality), bar_unit(known))
         shown = []
         for frame in frames:
             image = module.predict(replace(frame, camera=frame.camera.within(self.size))).cpu()

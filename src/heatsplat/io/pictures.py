@@ -28,6 +28,7 @@ from heatsplat.contracts import ThermalRange
 
 THERMAL = "inferno"
 ERROR = "RdBu_r"  # red: rendered too warm, blue: too cold
+IMAGE_VALUES = "image value"  # stands at the bar of thermal images that are no temperatures
 UNKNOWN = ((128, 128, 128), (176, 176, 176))  # NaN and masked pixels are hatched in two greys
 HATCH = 3  # pixels of a stripe
 
@@ -119,6 +120,11 @@ def enlarged(image: np.ndarray, factor: int) -> np.ndarray:
     return np.repeat(np.repeat(image, factor, axis=0), factor, axis=1)
 
 
+def bar_unit(thermal_range: ThermalRange | None) -> str:
+    """What numbers at the bar of a thermal image are."""
+    return IMAGE_VALUES if thermal_range is None else "°C"
+
+
 def image_panel(image: Any, title: str, bar: Bar, thermal_range: ThermalRange | None = None) -> Panel:
     """An image [H, W, C] under a title: with C = 3 in its own colours, with C = 1 in those of a bar, which stands beside it.
 
@@ -175,7 +181,7 @@ def comparison_panels(
     target, prediction = (np.asarray(image, dtype=np.float32) for image in (target, prediction))
     counted, error = difference(target, prediction, thermal_range, mask)
     thermal = target.shape[2] == 1
-    unit = "°C" if thermal and thermal_range else ""
+    unit = bar_unit(thermal_range) if thermal else ""
     if error_limit is None:
         error_limit = error_limit_of(np.abs(error[counted]))
 

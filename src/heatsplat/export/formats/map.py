@@ -20,7 +20,7 @@ from heatsplat.export.place import AUTO, Place, place_of
 from heatsplat.export.seams import comparison, mosaic, shift_between, smoothed
 from heatsplat.geometry.coverage import OPEN, covered, gap_free, seen_means, surface_depth
 from heatsplat.geometry.looks import surface_points
-from heatsplat.io.pictures import Bar, Panel, bounds_of, colorize, compose, enlarged, lettering, write_png
+from heatsplat.io.pictures import IMAGE_VALUES, Bar, Panel, bounds_of, colorize, compose, enlarged, lettering, write_png
 from heatsplat.io.quantities import moment as said
 from heatsplat.shots import at_time, checked_unseen, deviations_told, first_free_id, sightings
 from heatsplat.uncertainty import Uncertainty
@@ -138,7 +138,7 @@ class Map(Format):
         names = ("images", before, now if now != before else f"{now}, this run")
         maps = dict(zip(names, (recorded, other.values, own), strict=True))
         spread = next((band for title, band in bands.items() if title.startswith(DEVIATION)), None)
-        write_png(path.with_suffix(".png"), comparison(maps, owner, unit, spread))
+        write_png(path.with_suffix(".png"), comparison(maps, owner, unit or IMAGE_VALUES, spread))
 
     def _grid(self, scene: SceneData, place: Place) -> tuple[float, float, float, int, int]:
         """West and north edge, width of a pixel, columns and rows.
@@ -266,7 +266,7 @@ def _picture(values: np.ndarray, moment: Moment, place: Place, pixel: float) -> 
     )
     title = moment.module.scene.name + ("" if moment.time_s is None else f" after {said(moment.time_s)}")
     title += f", north up, {place.crs}" if place.crs else ""
-    return compose([Panel(np.asarray(page), title, Bar(low, high, moment.seen.unit))])
+    return compose([Panel(np.asarray(page), title, Bar(low, high, moment.seen.unit or IMAGE_VALUES))])
 
 
 def _from_above(
