@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from heatsplat.callbacks.report import show
-from heatsplat.callbacks.report_text import _picture, cells, effects_table, markdown
+from heatsplat.callbacks.report_text import _picture, cells, data_lines, effects_table, markdown
 from heatsplat.io.page import page
 from heatsplat.io.results import RunResults
 
@@ -47,8 +47,30 @@ def test_a_clock_has_its_date_beside_its_seconds(tmp_path):
         "duration_s": 1800.0,
     }
     text = markdown(RunResults(run={"method": "etgs", "scene": "a"}, data=data), tmp_path, [], None)
-    assert "- clock_at_zero_s: 1722965689.25 (2024-08-06 17:34:49)\n" in text
-    assert "utc_at_zero_s 1722965689 (2024-08-06 17:34:49 UTC), wind calm" in text and "- duration_s: 1800\n" in text
+    assert "- camera's clock at second 0: 2024-08-06 17:34:49\n" in text
+    assert "- weather: time at second 0 2024-08-06 17:34:49 UTC, wind calm\n" in text and "- duration: 1800 s\n" in text
+
+
+def test_the_data_are_told_in_words_with_their_units():
+    data = {
+        "views": {"train": 63, "val": 8, "test": 9}, "image_sizes": ["40x32"], "seconds": 1779.98,
+        "thermal_range_c": [21.0, 62.0], "ambient_c": 22.0, "metres_per_unit": None, "noise_k": 0.05, "duration_s": 1779.98,
+        "split": "every_8th", "train_views": 63, "pixel_type": "uint16", "image_size": "160x128 (3), 80x64 (1)",
+        "test_pixels_saturated": 0.00125, "weather_air_source": "a_b.csv", "origin": [1.5, 2.0, 3.0], "warmest_c": 33.21,
+        "learned_twice": True,
+    }  # fmt: skip
+    assert data_lines(data) == [
+        "- images: 63 to train, 8 to validate, 9 to test", "- size of the images in training: 40x32 pixels",
+        "- length of the record: 29.7 min", "- temperatures that an image can hold: 21 to 62 °C",
+        "- temperature of the surroundings: 22 °C", "- length of a unit of the scene: –", "- noise of the camera: 0.05 K",
+        "- test images are chosen by: every 8th image", "- numbers in the image files: 16-bit integers",
+        "- size of the images as stored: 160x128 (3), 80x64 (1) pixels",
+        "- pixels of the test images at the camera's ends: 0.125 %", "- weather air source: a_b.csv", "- origin: 1.5, 2, 3",
+        "- warmest: 33.21 °C", "- learned twice: True",
+    ]  # fmt: skip
+    assert data_lines({"thermal_range_c": "none: image values", "duration_s": 5.0}) == [
+        "- temperatures that an image can hold: none: image values", "- duration: 5 s",
+    ]  # fmt: skip
 
 
 def effect(on: bool, told: bool, statistic: float | None, reason: str) -> dict:

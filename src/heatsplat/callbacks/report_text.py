@@ -16,13 +16,58 @@ from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
 from heatsplat.callbacks.turntable import TURNTABLE_FILE
 from heatsplat.io.citations import citations
 from heatsplat.io.page import plain
-from heatsplat.io.quantities import CLOCKS, Clock, moment
+from heatsplat.io.quantities import CLOCKS, Clock, moment, words_and_unit
 from heatsplat.io.results import CURVE_FILE, RunResults
 from heatsplat.io.tables import NONE, markdown_table, read_csv
 from heatsplat.metrics.definitions import described, unit_of
 from heatsplat.viewer.page import FILE as VIEWER_FILE
 
 DEFINITIONS_TITLE = "Definitions of the scores"
+
+# What a name of the data is in words, with the unit, where the name itself does not tell (``io.quantities.words_and_unit``).
+DATA_WORDS = {
+    "views": ("images", ""),
+    "image_sizes": ("size of the images in training", "pixels"),
+    "image_size": ("size of the images as stored", "pixels"),
+    "grid": ("size of the images after shrinking", "pixels"),
+    "downscale": ("images are shrunk by", ""),
+    "seconds": ("length of the record", "s"),
+    "points": ("points of the scene", ""),
+    "thermal_range_c": ("temperatures that an image can hold", "°C"),
+    "training_images_c": ("temperatures in the training images", "°C"),
+    "ambient_c": ("temperature of the surroundings", "°C"),
+    "metres_per_unit": ("length of a unit of the scene", "m"),
+    "noise_k": ("noise of the camera", "K"),
+    "bits": ("bits of a pixel", ""),
+    "pose_error_px": ("error of the poses", "pixels"),
+    "effects": ("effects in the scene", ""),
+    "probes": ("points whose temperature is known", ""),
+    "split": ("test images are chosen by", ""),
+    "val_views": ("validation images", ""),
+    "pixel_type": ("numbers in the image files", ""),
+    "channels": ("channels of the image files", ""),
+    "clipped_fraction": ("pixels beyond these temperatures", "%"),
+    "masked_fraction": ("pixels that do not count", "%"),
+    "test_pixels_counted": ("pixels of the test images that count", "%"),
+    "test_pixels_saturated": ("pixels of the test images at the camera's ends", "%"),
+    "utc_at_zero_s": ("time at second 0", ""),
+    "clock_at_zero_s": ("camera's clock at second 0", ""),
+    "prepared_uncertainty_c": ("uncertainty of the temperatures, by preparation", "°C"),
+}
+DATA_VALUES = {
+    "uint8": "8-bit integers",
+    "uint16": "16-bit integers",
+    "float32": "floating point",
+    "L": "one, grey",
+    "RGB": "three, colours",
+    "every_8th": "every 8th image",
+}
+TWICE = {
+    "train_views": "views",
+    "test_views": "views",
+    "duration_s": "seconds",
+}  # told by the other name, where that is there
+PARTS = {"train": "to train", "val": "to validate", "test": "to test"}
 
 
 def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves: Path | None) -> str:
@@ -60,7 +105,7 @@ def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves
     lines += learned_section(folder)
     lines += ["", "## The run", "", *_bullets(run)]
     lines += _effects_section(content["effects"])
-    lines += ["", "## Data: findings and assumptions", "", *_bullets(content["data"])]
+    lines += ["", "## Data: findings and assumptions", "", *data_lines(content["data"])]
     lines += ["", f"## {DEFINITIONS_TITLE}", "", *_bullets(content["definitions"])]
     lines += ["", "## Versions", "", *_bullets(content["versions"])]
     if entries := citations(run.get("method")):
@@ -207,25 +252,40 @@ def _number(value: float) -> str:
     return f"{value:.4g}"
 
 
+def data_lines(data: Mapping[str, Any]) -> list[str]:
+    """A list for Markdown of what metrics.json tells of the data, in words and with units."""
+    shown = (_in_words(name, value) for name, value in data.items() if TWICE.get(name) not in data)
+    return [f"- {words}: {told}" for words, told in shown]
+
+
+def _in_words(name: str, value: Any) -> tuple[str, str]:
+    """A name of the data and its value for people, with its unit where it is a number; one level of nesting in line."""
+    words, unit = DATA_WORDS.get(name) or words_and_unit(name)
+    if isinstance(value, Mapping):
+        if name == "views":
+            return words, ", ".join(f"{_words(count)} {PARTS.get(part, part)}" for part, count in value.items())
+        return words, ", ".join(" ".join(_in_words(*item)) for item in value.items()) or "on"
+    values = value if isinstance(value, list | tuple) else [value]
+    numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
+    if name in CLOCKS and numbers:
+        return words, Clock(value, CLOCKS[name]).at(0.0, "seconds")
+    if name == "seconds" and numbers:
+        return words, moment(value)
+    if unit == "%" and numbers:
+        return words, f"{100 * value:.3g} %"
+    told = (" to " if unit and numbers and len(values) == 2 else ", ").join(map(_words, values))
+    sized = unit == "pixels" and value is not None  # sizes are text, such as 40x32
+    return words, f"{DATA_VALUES.get(told, told)} {unit}".rstrip() if numbers or sized else DATA_VALUES.get(told, told)
+
+
 def _bullets(values: Mapping[str, Any]) -> list[str]:
     """A list of names and values for Markdown, one level of nesting in line."""
     lines = []
     for name, value in values.items():
         nested = isinstance(value, Mapping)
-        words = (
-            ", ".join(f"{key} {_told(key, item)}" for key, item in value.items()) or "on"
-            if nested
-            else _told(name, value)
-        )
+        words = ", ".join(f"{key} {_words(item)}" for key, item in value.items()) or "on" if nested else _words(value)
         lines.append(f"- {name}: {words}")
     return lines
-
-
-def _told(name: str, value: Any) -> str:
-    """A value of this name for people: ``_words``, and with the date beside what a clock shows."""
-    if name in CLOCKS and isinstance(value, int | float):
-        return f"{value:.15g} ({Clock(value, CLOCKS[name]).at(0.0, 'seconds')})"
-    return _words(value)
 
 
 def _words(value: Any) -> str:
