@@ -11,11 +11,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from heatsplat.contracts import SceneData, SceneError, counted, evenly_spread
+from heatsplat.contracts import SceneError, counted, evenly_spread
+from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
 from heatsplat.datamodules.formats.radiometric import read_bytes
 from heatsplat.datamodules.nerfstudio import Nerfstudio, find_transforms
+from heatsplat.datamodules.ntr import NTR
+from heatsplat.datamodules.posed_frames import FILES
+from heatsplat.datamodules.rgbt_scenes import RGBTScenes, is_paired
+from heatsplat.datamodules.rhd import RHD
+from heatsplat.datamodules.thermo import Thermo
 from heatsplat.datamodules.timestamps import instant, zone_of
 from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
 from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, warn, write_findings
@@ -27,6 +33,14 @@ from heatsplat.preparation.report import Section
 
 log = logging.getLogger(__name__)
 
+PROTOCOL_POINTS = "points3D.ply"  # of a scene of the leaderboard's protocol, whose meta.json is another one
+# What loaders say of where numbers come from.
+SOURCES = {
+    "encoding": "values",
+    "bounds_source": "temperature bounds",
+    "time_source": "times",
+    "points_source": "points",
+}
 QUARTER_S = 900.0  # zones lie whole quarters of an hour apart
 LATER = "Drift, poses, focal length and what else needs cameras is looked at once they are known."
 DONE = {"dead_pixels": "The masks of the prepared scene leave them out."}  # what a preparation does by itself
@@ -45,17 +59,23 @@ def check(
     """Looks for what is wrong with a folder, prints a table of it, and writes it to doctor.json.
 
     Args:
-        folder: a scene with a COLMAP model or transforms.json, or a camera's files.
+        folder: a scene, or a camera's files.
         target: where doctor.json is written; None: in the working directory.
         downscale: factor by which images of a scene shrink before they are looked at.
         counts, bounds_c: of ``Meaning``, for a camera's files.
         zone, table, table_columns: of ``Reading``, for a camera's files.
 
     Raises:
-        SceneError: the folder holds neither.
+        SceneError: the folder holds neither, or something is said of a camera's files and it is a scene.
     """
     reading = reading_of(counts=counts, bounds_c=bounds_c, zone=zone, table=table, table_columns=table_columns)
     materials, notes = materials_in(Path(folder).expanduser(), downscale, reading)
+    said = {"bounds_c": bounds_c, "zone": zone, "table": table}
+    said |= {f"counts.{name}": value for name, value in (counts or {}).items()}
+    if "" in materials and (idle := [name for name, value in said.items() if value is not None]):
+        raise SceneError(
+            f"{idle[0]} changes nothing for the scene in {folder}: it is for a camera's files, leave it out"
+        )
     for note in notes:
         log.info("%s", note)
     found = examined(materials)
@@ -98,10 +118,8 @@ def materials_in(
     """
     if not folder.is_dir():
         raise SceneError(f"check={folder}: there is no such folder")
-    if find_model(folder) is not None:
-        return {"": material_of(_colmap(folder, downscale))}, []
-    if find_transforms(folder):
-        return {"": material_of(Nerfstudio(root=str(folder), downscale=downscale).scene)}, []
+    if (loader := _loader_of(folder, downscale)) is not None:
+        return {"": material_of(loader.scene)}, _assumed(loader)
     reading = reading or Reading()
     recording = read_recording(folder, reading)
     devices = devices_of(recording.frames)
@@ -119,12 +137,37 @@ def examined(materials: Mapping[str, Material]) -> list[Finding]:
     return sorted(found, key=lambda one: -one.cost)
 
 
-def _colmap(folder: Path, downscale: float) -> SceneData:
-    """A scene with a sparse model, with counts and photos where folders of the usual names hold them."""
-    raw = "raw16" if (folder / "raw16").is_dir() else None
-    rgb = "rgb" if (folder / "rgb").is_dir() else None
-    times = "times.csv" if (folder / "times.csv").is_file() else None
-    return Colmap(root=str(folder), raw=raw, rgb=rgb, time_csv=times, downscale=downscale).scene
+def _loader_of(folder: Path, downscale: float) -> SceneDataModule | None:
+    """What reads the scene in a folder, by its files; None where these are no scene.
+
+    Layouts that look alike have other axes or bounds: the first that fits reads them. Where images lie beside a sparse model,
+    counts, photos and times in folders and files of the usual names are taken.
+    """
+
+    def has(*names: str) -> bool:
+        return all((folder / name).exists() for name in names)
+
+    given = {"root": str(folder), "downscale": downscale}
+    model, both = find_model(folder) is not None, has(*FILES.values())
+    if has("meta.json") and (model or both) and not has(PROTOCOL_POINTS):
+        return Thermo(**given)
+    if find_model(folder / "thermal") is not None or (model and has("info.json")):
+        return RHD(**given)
+    if both and has("mesh.obj"):
+        return NTR(**given)
+    if find_transforms(folder):  # a model beside it gives points alone
+        return Nerfstudio(**given)
+    if is_paired(folder) and not has("images"):
+        return RGBTScenes(**given)
+    usual = {"raw": "raw16", "rgb": "rgb", "time_csv": "times.csv"}
+    return Colmap(**given, **{key: name for key, name in usual.items() if has(name)}) if model else None
+
+
+def _assumed(loader: SceneDataModule) -> list[str]:
+    """How a scene was read, a sentence for each thing."""
+    notes = loader.scene.notes
+    told = [f"read as data={type(loader).__module__.rpartition('.')[2]} reads it"]
+    return told + [f"{SOURCES[name]}: {notes[name]}" for name in SOURCES if name in notes]
 
 
 def _recorded(device: Device, zone: str | None) -> Material:

@@ -12,6 +12,7 @@ from recordings import read_frames
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.synthetic_scene import writers
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, write_camera
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
@@ -30,6 +31,33 @@ def test_a_clean_scene_has_no_findings_and_the_file_says_so(tmp_path):
     write_colmap(film(Scene(PRESETS["static"]), SIZES["tiny"]), tmp_path / "scene")
     assert check(str(tmp_path / "scene"), tmp_path) == []
     assert json.loads((tmp_path / "doctor.json").read_text()) == []
+
+
+@pytest.mark.parametrize(
+    ("layout", "told"),
+    [
+        ("colmap", "values: 16-bit counts in raw16/"),
+        ("ntr", "points: vertices of mesh.obj"),
+        ("thermo", "points: vertices of mesh.obj"),
+        ("rhd", "temperature bounds: info.json"),
+        ("rgbt_scenes", "times: none: the data set has no times"),
+        ("thermoscenes", "temperature bounds: temperature_bounds.json"),
+    ],
+)
+def test_scenes_of_every_layout_are_read_as_their_loaders_read_them(tmp_path, caplog, layout, told):
+    getattr(writers, f"write_{layout}")(film(Scene(PRESETS["static"]), SIZES["tiny"]), tmp_path / "scene")
+    with caplog.at_level("INFO"):
+        assert check(str(tmp_path / "scene"), tmp_path) == []
+    name = "nerfstudio" if layout == "thermoscenes" else layout  # whose layout it is
+    assert f"read as data={name} reads it" in caplog.messages and told in caplog.text
+
+
+def test_what_is_said_of_a_camera_s_files_is_refused_for_a_scene(tmp_path):
+    write_colmap(film(Scene(PRESETS["static"]), SIZES["tiny"]), tmp_path / "scene")
+    with pytest.raises(SceneError, match="bounds_c changes nothing for the scene in .*: it is for a camera's files"):
+        check(str(tmp_path / "scene"), tmp_path, bounds_c=[0, 50])
+    with pytest.raises(SceneError, match="counts.scale changes nothing"):
+        check(str(tmp_path / "scene"), tmp_path, counts={"offset_c": None, "scale": 0.01})
 
 
 def test_dead_pixels_and_a_late_clock_are_found_in_a_camera_s_files(tmp_path):
