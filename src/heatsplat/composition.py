@@ -20,11 +20,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError
 
 from heatsplat import CHECKOUT
+from heatsplat.io.files import short_name
 from heatsplat.io.results import checkpoint_of
 from heatsplat.io.settings import at, walk
 from heatsplat.training.machine import cores
 
 ROOT = CHECKOUT or Path.cwd()  # outputs/ goes there
+LONGEST_SCENE = 80  # bytes of its name in a folder's, of which file systems allow 255
 CONF = str((CHECKOUT or Path(__file__).resolve().parent) / "conf")
 
 build = functools.partial(hydra.utils.instantiate, _convert_="all")
@@ -195,9 +197,11 @@ def prepared_folder(target: str | None) -> str:
 
 
 def scene_name(data: str, root: str | None, scene: str | None) -> str:
-    """Name of the scene in the run's folder: data.scene, else the last folder of data.root, else the data set."""
+    """Name of the scene in the run's folder: data.scene, else the last folder of data.root, else the data set; cut where it is
+    long (``io.files.short_name``)."""
     name = scene or (Path(root).name if root else None) or data
-    return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in str(name))
+    plain = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in str(name))
+    return short_name(plain, LONGEST_SCENE)
 
 
 def _steps(fraction: float, minimum: int = 1, *, _root_: DictConfig) -> int:

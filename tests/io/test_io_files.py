@@ -2,7 +2,7 @@
 
 import pytest
 
-from heatsplat.io.files import read_json_object, size_told, write_atomically
+from heatsplat.io.files import read_json_object, short_name, size_told, write_atomically
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
@@ -32,3 +32,12 @@ def test_small_files_have_a_size_too():
         "0.1 MB",
         "3.4 MB",
     ]
+
+
+def test_names_that_are_too_long_lose_their_middle_and_still_differ():
+    assert short_name("a" * 40, 40) == "a" * 40 and short_name("küche", 6) == "küche"
+    for letter in ("a", "ü", "漢", "😀"):
+        names = [short_name(letter * 60 + end, 40) for end in "12"]
+        assert len(set(names)) == 2 and all(len(name.encode()) <= 40 and name.startswith(letter) for name in names)
+        assert names[0].encode().decode() == names[0]
+    assert short_name("a-b", 40, "a/b") == short_name("a-b", 40, "a/b") != short_name("a-b", 40)

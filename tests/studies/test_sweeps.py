@@ -12,6 +12,7 @@ from finished_runs import job
 from hydra.core.utils import JobReturn, JobStatus
 from running import NO_PICTURES, compose_run
 
+from heatsplat.composition import scene_name
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 from heatsplat.runs.resume import NOT_LEARNED
@@ -233,12 +234,24 @@ def test_folders_have_names_that_are_cut_and_still_differ():
     assert folder_name(f"seed=0,{long}x=1") != folder_name(
         f"seed=0,{long.replace('null', '0', 4)}x=1"
     )  # alike at both ends
+    umlauts = folder_name("data.time_csv=" + "zürich_übung_" * 12 + "seed=1")
+    assert len(umlauts.encode()) <= 120 and umlauts.startswith("data.time_csv=zürich") and "seed=1-" in umlauts
     inside = {
         folder_name("ckpt=runs/last.ckpt"),
         folder_name("ckpt=runs-last.ckpt"),
         folder_name("ckpt=runs\\last.ckpt"),
     }
     assert len(inside) == 3 and not any("/" in name for name in inside)
+
+
+def test_folders_of_scenes_with_long_names_fit():
+    assert (
+        scene_name("colmap", "/data/Dach (Süd)", None) == "Dach--Süd-" and scene_name("colmap", None, None) == "colmap"
+    )
+    names = [scene_name("colmap", f"/data/{'küche_' * 30}{number}", None) for number in (1, 2)]
+    assert names[0] != names[1] and all(len(name.encode()) <= 80 and name.startswith("küche_") for name in names)
+    job = folder_name("thermal.source_penalty=0.1," * 20)
+    assert len(f"energy_balance_{names[0]}_100_{job}".encode()) <= 255
 
 
 class Remembering:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -12,6 +13,24 @@ from typing import Any
 def by_numbers(name: str) -> list[str | int]:
     """What names are sorted by so that "image 2" comes before "image 10"."""
     return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", name))]
+
+
+def short_name(name: str, most: int, whole: str | None = None) -> str:
+    """A file's name of at most so many bytes, which file systems count: what is longer loses its middle.
+
+    Args:
+        name: that is cut where it is too long.
+        most: bytes.
+        whole: what it stands for; None is the name itself. A hash of it stands behind a name that says less than it.
+    """
+    whole, content = name if whole is None else whole, name.encode()
+    if name == whole and len(content) <= most:
+        return name
+    mark = f"-{hashlib.sha256(whole.encode()).hexdigest()[:8]}"
+    if len(content) > most - len(mark):
+        half = (most - len(mark) - len("..")) // 2
+        name = "..".join(end.decode(errors="ignore") for end in (content[:half], content[-half:]))
+    return name + mark
 
 
 def write_atomically(path: str | Path, content: str | bytes | memoryview) -> None:

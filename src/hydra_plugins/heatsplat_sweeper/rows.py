@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import logging
 import re
@@ -20,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from heatsplat.errors import SceneError
 from heatsplat.io.command_lines import keys_of
+from heatsplat.io.files import short_name
 from hydra_plugins.heatsplat_launchers._jobs import JobLauncher, composed, planned
 
 if TYPE_CHECKING:
@@ -27,23 +27,15 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("heatsplat")
 
-LONGEST = 120  # letters; file systems allow 255 bytes, and row, scene and number come with them
+LONGEST = 120  # bytes; file systems allow 255, and row, scene and number come with them
 
 
 def folder_name(overrides: str) -> str:
     """Overrides of a job as a part of its folder's name: the same for the same job, another for every other job.
 
-    What is too long loses its middle, for seeds stand at its end; what would be a folder of its own is written in one. A hash
-    of the whole then stands behind.
+    What is too long loses its middle, for seeds stand at its end; what would be a folder of its own is written in one.
     """
-    name = re.sub(r"[/\\]", "-", overrides)
-    if len(name) <= LONGEST and name == overrides:
-        return name
-    mark = f"-{hashlib.sha256(overrides.encode()).hexdigest()[:8]}"
-    if len(name) > LONGEST - len(mark):
-        half = (LONGEST - len(mark) - len("..")) // 2
-        name = f"{name[:half]}..{name[-half:]}"
-    return name + mark
+    return short_name(re.sub(r"[/\\]", "-", overrides), LONGEST, overrides)
 
 
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
