@@ -89,7 +89,10 @@ def by_subset(subsets: Sequence[str | None]) -> Positions:
 def by_list(names: Sequence[str], path: Path) -> Positions:
     """Positions by a file: test names one per line, or JSON {"train": [...], "test": [...]} (no "train": all others).
 
-    Names may be given with or without their folder and extension.
+    Names may be given with or without their folder and extension; a frame that has a name as a whole goes before others.
+
+    Raises:
+        SceneError: the file holds no such lists, or a name of no frame, or one that may be of several.
     """
     if path.suffix.lower() == ".json":
         lists = json_object(path)
@@ -103,19 +106,27 @@ def by_list(names: Sequence[str], path: Path) -> Positions:
     else:  # Excel may have put names into quotes, and separators behind them
         lines = (line.strip().rstrip(",;\t").strip('"') for line in read_text(path).splitlines())
         lists = {"test": [line for line in lines if line]}
-    known: dict[str, int] = {}
+    whole = {name: [i] for i, name in enumerate(names)}
+    parts: dict[str, list[int]] = {}
     for i, name in enumerate(names):
-        for key in (name, PurePosixPath(name).name, PurePosixPath(name).stem):
-            known.setdefault(key, i)
+        path_in = PurePosixPath(name)
+        for key in {path_in.with_suffix("").as_posix(), path_in.name, path_in.stem}:
+            parts.setdefault(key, []).append(i)
 
     def positions(listed: Sequence[str]) -> list[int]:
-        unknown = [name for name in listed if name not in known]
+        meant = {name: whole.get(name) or parts.get(name, []) for name in listed}
+        unknown = [name for name, found in meant.items() if not found]
         if unknown:
             raise SceneError(
                 f"data.split_file: {path} lists {unknown[0]!r}, which is no frame of the scene "
                 f"({len(unknown)} such names; the scene's names look like {names[0]!r})"
             )
-        return sorted({known[name] for name in listed})
+        if several := next((name for name, found in meant.items() if len(found) > 1), None):
+            raise SceneError(
+                f"data.split_file: {path} lists {several!r}, which may be "
+                f"{' or '.join(names[i] for i in meant[several])}; write the name with its folder and extension"
+            )
+        return sorted({found[0] for found in meant.values()})
 
     test = positions(lists["test"])
     return (positions(lists["train"]), test) if "train" in lists else _complement(len(names), test)

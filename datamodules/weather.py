@@ -99,8 +99,11 @@ def make_weather(
     if FALLEN in columns:
         if RAIN in columns:
             raise SceneError(f"{source} tells rain twice, as {RAIN} and as {FALLEN}; keep one")
+        # Between samples the rate is linear: about each it lasts for half of the time to either neighbour, so that what falls in
+        # all is what was measured, however uneven the samples are.
         hours = np.diff(times_s) / 3600.0
-        columns[RAIN] = columns.pop(FALLEN) / np.concatenate([hours[:1], hours])
+        before, after = np.concatenate([hours[:1], hours]), np.concatenate([hours, hours[-1:]])
+        columns[RAIN] = columns.pop(FALLEN) / (0.5 * (before + after))
         notes["rain"] = "of what fell since the sample before"
     missing = [name for name in WEATHER_COLUMNS if name not in columns]
     if missing:

@@ -156,9 +156,8 @@ def read_columns(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np
     own_zone = "UTC" if plain[time_at].endswith("utc") else zone
     times, values = [], {name: [] for name in wanted}
     for number, cells in table.rows:
-        times.append(
-            utc_seconds(table.pointed(cells[time_at]), own_zone, f"{path}, line {number}, column {header[time_at]}")
-        )
+        where = f"{path}, line {number}, column {header[time_at]}"
+        times.append(utc_seconds(table.pointed(cells[time_at]), own_zone, where, times[-1] if times else None))
         for name, (position, (scale, offset)) in wanted.items():
             cell = cells[position]
             if cell.lower() in MISSING:
@@ -197,8 +196,15 @@ def utc_text(seconds: float) -> str:
     return datetime.fromtimestamp(float(seconds), UTC).isoformat()
 
 
-def utc_seconds(text: str | float, zone: str | None, where: str) -> float:
+def utc_seconds(text: str | float, zone: str | None, where: str, after: float | None = None) -> float:
     """Seconds since 1970 UTC of an ISO date-time, or a number as it is.
+
+    Args:
+        text: the date-time, or the number.
+        zone: of a date-time without an offset.
+        where: it stands, for messages.
+        after: the time in the row before, or None. Of an hour that clocks show twice, as summer time ends, it is the second
+            where the first would not come after that.
 
     Raises:
         SceneError: it is neither, or it has no offset and ``zone`` is None; ``where`` is named.
@@ -220,6 +226,9 @@ def utc_seconds(text: str | float, zone: str | None, where: str) -> float:
                 "they are: weather_zone=UTC, +02:00 or Europe/Berlin"
             )
         moment = moment.replace(tzinfo=zone_of(zone, "weather_zone"))
+        again = moment.replace(fold=1)
+        if after is not None and moment.timestamp() <= after < again.timestamp():
+            moment = again
     return moment.timestamp()
 
 

@@ -67,6 +67,24 @@ def test_lists_in_text_and_json(tmp_path):
     assert by_list(names, tmp_path / "split.json") == ([0], [2])
 
 
+def test_a_listed_name_is_the_frame_of_that_name_before_one_that_ends_so(tmp_path):
+    path = tmp_path / "test.txt"
+    path.write_text("b.png\n")
+    assert by_list(["a/b.png", "b.png"], path) == ([0], [1])
+    path.write_text("right/1\n")
+    assert by_list(["left/1.png", "right/1.png"], path) == ([0], [1])
+
+
+@pytest.mark.parametrize("listed", ["1.png", "1"])
+def test_a_listed_name_that_several_frames_may_have_is_refused(tmp_path, listed):
+    path = tmp_path / "test.txt"
+    path.write_text(f"{listed}\n")
+    with pytest.raises(
+        SceneError, match=f"lists '{listed}', which may be left/1.png or right/1.png; write the name with"
+    ):
+        by_list(["left/1.png", "right/1.png"], path)
+
+
 def test_lists_name_the_frame_that_does_not_exist(tmp_path):
     (tmp_path / "test.txt").write_text("9.png\n")
     with pytest.raises(SceneError, match=r"test.txt lists '9.png', which is no frame.*'1.png'"):

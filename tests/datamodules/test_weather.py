@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
+from datetime import datetime
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
@@ -211,6 +213,18 @@ def test_recorded_clouds_take_their_share_of_light_that_was_not_measured(table):
     assert "clouds take" in dull.notes["irradiance"] and "clouds" not in clear.notes["irradiance"]
 
 
+@pytest.mark.parametrize("minutes", [60, 10])
+def test_an_hour_that_clocks_show_twice_comes_twice(table, minutes):
+    first_s, step_s = 1729980000.0, 60.0 * minutes  # 2024-10-26, 22:00 UTC; at 1:00 UTC summer time ends in Berlin
+    times_s = [first_s + k * step_s for k in range(6 * 60 // minutes)]
+    shown = [datetime.fromtimestamp(time_s, ZoneInfo("Europe/Berlin")).replace(tzinfo=None) for time_s in times_s]
+    lines = [f"{time.isoformat()},{k}" for k, time in enumerate(shown)]
+    weather = read_weather(table("time,air_c", *lines), zone="Europe/Berlin")
+    assert weather.times_s.tolist() == times_s
+    assert weather.air_c.tolist() == [*range(len(times_s))]
+    assert not {"unsorted", "duplicates"} & weather.notes.keys()
+
+
 def test_rain_is_a_rate_or_what_fell_since_the_sample_before(table):
     by_rate = read_weather(table("utc,rain_mm_h", *day("2.5")))
     assert (by_rate.rain_mm_h == 2.5).all()
@@ -218,7 +232,8 @@ def test_rain_is_a_rate_or_what_fell_since_the_sample_before(table):
     assert torch.allclose(inches.rain_mm_h, torch.tensor(2.54).double())
     halves = [f"2024-07-11T06:{minute:02d}:00Z,{mm}" for minute, mm in ((0, 0), (10, 0.5), (30, 2), (40, ""))]
     fallen = read_weather(table("utc,Precipitation [mm]", *halves))
-    assert torch.allclose(fallen.rain_mm_h, torch.tensor([0.0, 3.0, 6.0, 0.0]).double())
+    assert torch.allclose(fallen.rain_mm_h, torch.tensor([0.0, 2.0, 8.0, 0.0]).double())
+    assert torch.trapezoid(fallen.rain_mm_h, fallen.times_s / 3600.0).item() == pytest.approx(2.5)  # mm, all that fell
     assert (
         fallen.notes["dry"] == "1 samples without rain_mm are taken for dry"
         and "since the sample" in fallen.notes["rain"]

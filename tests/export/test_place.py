@@ -7,7 +7,12 @@ import pytest
 import torch
 
 from heatsplat.contracts import SceneError, ViewSet
-from heatsplat.export.place import place_of, placed, unit_in_metres
+from heatsplat.export.formats.gltf import Gltf
+from heatsplat.export.formats.las import Las
+from heatsplat.export.formats.map import Map
+from heatsplat.export.formats.ply import Ply
+from heatsplat.export.formats.spz import Spz
+from heatsplat.export.place import place_in_file, place_of, placed, unit_in_metres
 
 rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (pip install -e '.[dev]')")
 
@@ -35,6 +40,33 @@ def test_positions_give_the_projection_the_scale_and_the_turn(cooling, tmp_path)
     turn = math.radians(30.0)
     expected = [[5e5, 5.2e6, 100.0], [5e5 + 2 * math.cos(turn), 5.2e6 + 2 * math.sin(turn), 101.0]]
     assert (found - torch.tensor(expected, dtype=torch.float64)).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize(("middle_deg", "crs"), [(180.0 - 1e-6, "EPSG:32760"), (180.0 + 1e-6, "EPSG:32701")])
+def test_positions_on_both_sides_of_the_180th_meridian_lie_in_the_zone_of_their_middle(
+    cooling, tmp_path, middle_deg, crs
+):
+    scene, path, lines = cooling.module.scene, tmp_path / "gps.csv", ["file,latitude_deg,longitude_deg,altitude_m"]
+    centers = torch.stack([frame.camera.center for frame in scene.frames]).double()
+    longitudes = (middle_deg + 1e-5 * (centers[:, 0] - centers[:, 0].mean()) + 180.0) % 360.0 - 180.0
+    assert longitudes.min() < -179 and longitudes.max() > 179
+    for frame, longitude, (_, y, z) in zip(scene.frames, longitudes.tolist(), centers.tolist(), strict=True):
+        lines.append(f"{frame.name},{-16.8 + 1e-5 * y:.9f},{longitude:.9f},{z}")
+    path.write_text("\n".join(lines) + "\n")
+    place = place_of(scene, path)
+    assert place.crs == crs
+    latitude, longitude = place.latitudes_longitudes(centers.mean(0, keepdim=True))[0]
+    assert latitude == pytest.approx(-16.8, abs=1e-3) and abs(longitude) == pytest.approx(180.0, abs=1e-3)
+
+
+def test_only_coordinates_without_a_place_on_the_earth_are_said_to_count_from_the_origin(cooling, tmp_path, caplog):
+    scene = cooling.module.scene
+    scene = replace(scene, notes={**scene.notes, "origin": [6e5, 5.6e6, 100.0]})
+    assert place_in_file(scene, table(scene, tmp_path / "gps.csv")).crs == "EPSG:32632"
+    assert "count from" not in caplog.text
+    assert place_in_file(scene).crs is None
+    assert "coordinates count from 600000, 5600000, 100 of the data set" in caplog.text
+    assert [form.from_origin for form in (Ply, Gltf, Spz, Las, Map)] == [True, False, False, False, False]
 
 
 def test_tables_as_programs_write_them_and_images_of_one_name(cooling, tmp_path):

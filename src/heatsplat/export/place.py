@@ -117,6 +117,18 @@ def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | No
     return Place(Similarity(scale, rotation, shift), None, "unit of the scene" if metres is None else "metre")
 
 
+def place_in_file(scene: SceneData, gps: str | Path | None = None, above: Tensor | None = None) -> Place:
+    """As ``place_of``, for coordinates that are written: where these have no place on the earth, and an origin was taken off the
+    scene, a warning says what they are."""
+    place, origin = place_of(scene, gps, above), scene.notes.get("origin")
+    if place.crs is None and origin is not None:
+        log.warning(
+            "coordinates count from %s of the data set, whose numbers are too large for float32, in axes and lengths of their "
+            "own: what=ply and what=npz have those of the data set", ", ".join(f"{x:.10g}" for x in origin),
+        )  # fmt: skip
+    return place
+
+
 def placed(scene: SceneData) -> Place | None:
     """Where a scene lies on the earth by its own camera positions, as by ``place_of``; None where it has none that tell, or where
     rasterio is not installed."""
@@ -142,7 +154,7 @@ def upright(moment: Moment) -> tuple[Tensor, Tensor, Tensor]:
 
     The axes of glTF and of SPZ; in units of the scene where it has no scale.
     """
-    place = place_of(moment.module.scene)
+    place = place_in_file(moment.module.scene)
     scale, rotation, _ = place.similarity
     axes = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
     turned = axes @ rotation @ quats_to_matrices(moment.seen.quats.double())
@@ -163,8 +175,10 @@ def _placed(scene: SceneData, path: Path) -> Place:
         raise SceneError(f"{path} has positions of {len(found)} of the images ({names}, ...); 3 are needed")
     degrees = torch.tensor(list(found.values()), dtype=torch.float64)
     warp = optional("rasterio.warp", "map")
-    latitude, longitude = degrees[:, :2].mean(0).tolist()
-    crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + int((longitude + 180) // 6) + 1}"
+    # Degrees from the first one on: positions may lie on both sides of the 180th.
+    beside = (degrees[:, 1] - degrees[0, 1] + 180.0) % 360.0 - 180.0
+    latitude, longitude = float(degrees[:, 0].mean()), float(degrees[0, 1] + beside.mean())
+    crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + int((longitude + 180) // 6) % 60 + 1}"
     east, north = warp.transform("EPSG:4326", crs, degrees[:, 1].tolist(), degrees[:, 0].tolist())
     target = torch.tensor([east, north, degrees[:, 2].tolist()], dtype=torch.float64).T
     source = torch.stack(list(found)).double()

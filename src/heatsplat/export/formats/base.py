@@ -24,8 +24,8 @@ class Format(ABC):
 
     Class attributes:
         suffix: of its files, with the dot.
-        from_origin: whether coordinates count from the scene's "origin", where one was taken off numbers that float32 cannot
-            hold (``notes["origin"]``).
+        from_origin: whether coordinates are the scene's own, which count from its "origin" where one was taken off numbers
+            that float32 cannot hold (``notes["origin"]``).
     """
 
     suffix: str = ""

@@ -34,6 +34,7 @@ class Gltf(Coloured):
     """
 
     suffix = ".glb"
+    from_origin = False
 
     def write(self, moment: Moment, path: Path) -> None:
         means, quats, scales = (values.numpy() for values in upright(moment))

@@ -14,7 +14,7 @@ from torch import Tensor
 from heatsplat.contracts import SceneError, check_numbers, evenly_spread
 from heatsplat.export.formats.base import Coloured, extra_columns, optional
 from heatsplat.export.moment import Moment
-from heatsplat.export.place import AUTO, place_of
+from heatsplat.export.place import AUTO, place_in_file
 
 log = logging.getLogger("heatsplat")
 
@@ -33,6 +33,8 @@ class Las(Coloured):
         gps: table of camera positions, "auto" or None (``export.place``).
     """
 
+    from_origin = False
+
     def __init__(
         self,
         compressed: bool = True,
@@ -50,7 +52,7 @@ class Las(Coloured):
         laspy = optional("laspy", "las")
         if path.suffix == ".laz":
             optional("lazrs", "las")
-        place = place_of(moment.module.scene, self.gps)
+        place = place_in_file(moment.module.scene, self.gps)
         opaque = moment.seen.opacities >= self.least_opacity
         kept = (opaque & _shown(moment)).numpy()
         if not kept.any():

@@ -16,7 +16,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numbers
 from heatsplat.export.formats.base import Format, extra_columns, optional
 from heatsplat.export.moment import Moment
-from heatsplat.export.place import AUTO, Place, place_of
+from heatsplat.export.place import AUTO, Place, place_in_file
 from heatsplat.export.seams import comparison, mosaic, shift_between, smoothed
 from heatsplat.geometry.coverage import OPEN, covered, gap_free, seen_means, surface_depth
 from heatsplat.geometry.looks import surface_points
@@ -56,6 +56,7 @@ class Map(Format):
     """
 
     suffix = ".tif"
+    from_origin = False
 
     def __init__(
         self,
@@ -85,7 +86,7 @@ class Map(Format):
         rasterio = optional("rasterio", "map")
         from_origin = optional("rasterio.transform", "map").from_origin
         scene = moment.module.scene
-        place = place_of(scene, self.gps, self.above)
+        place = place_in_file(scene, self.gps, self.above)
         west, north, pixel, width, height = self._grid(scene, place)
         grid = from_origin(west, north, pixel, pixel)
         other = None if self.against is None else _other(rasterio, self.against)

@@ -29,6 +29,7 @@ class Spz(Coloured):
     """
 
     suffix = ".spz"
+    from_origin = False
 
     def write(self, moment: Moment, path: Path) -> None:
         means, quats, scales = (values.double().numpy() for values in upright(moment))
