@@ -29,11 +29,12 @@ if WORKERS:  # before torch is imported, which reads it once
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job: what it starts would not hear Ctrl-C
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Files that take longest, begun first: side by side, no process is left with one of them while the others have none.
+# Files that take longest, begun first: side by side, no process is left with one of them while the others have none. The first
+# two ask for different kernels, which both would compile.
 LONGEST = (
-    "viewer/test_page.py",
     "training/test_presets.py",
     "physics/test_physics_energy_balance.py",
+    "viewer/test_page.py",
     "project/test_command_line.py",
     "project/test_readme.py",
     "studies/test_sweeps.py",

@@ -21,6 +21,9 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
@@ -43,6 +46,8 @@ def quick_compositions() -> Iterator[None]:
         (ConfigLoaderImpl, "_compose_config_from_defaults_list", _merged_once(merge)),
         (ConfigLoaderImpl, "_load_single_config", _once(place, _file)),
         (config_loader_impl, "create_defaults_list", _listed_once(defaults_list.create_defaults_list)),
+        (OverridesParser, "parse_rule", _parsed_once(OverridesParser.parse_rule)),
+        (HydraConfig, "set_config", _set_config),
         (omegaconf.base.Box, "_re_parent", _re_parent),
         (defaults_list, "_create_interpolation_map", _where_needed(defaults_list._create_interpolation_map)),
         (version, "_get_version", functools.cache(version._get_version)),  # asked for eight hundred times
@@ -80,6 +85,31 @@ def _composed_once(compose: Callable) -> Callable:
     return composed
 
 
+def _parsed_once(parse: Callable) -> Callable:
+    """Overrides, of which most runs of tests have the same twenty; what is swept is parsed anew."""
+    known: dict[str, Override] = {}
+
+    def parsed(self, s, rule_name):
+        if rule_name != "override":
+            return parse(self, s, rule_name)
+        if s not in known:
+            found = parse(self, s, rule_name)
+            if found.is_sweep_override():
+                return found
+            known[s] = found
+        return copy.copy(known[s])  # whose loader is set
+
+    return parsed
+
+
+def _set_config(self: HydraConfig, cfg: DictConfig) -> None:
+    """As Hydra's, which copies the settings of Hydra node by node; here they are shared with the configuration, which loses them
+    next or is theirs to the end of a job."""
+    OmegaConf.set_readonly(cfg.hydra, True)
+    self.cfg = OmegaConf.create()
+    self.cfg.__dict__["_content"]["hydra"] = cfg._get_node("hydra")
+
+
 def _ours(sources: Any) -> bool:
     return [source.path for source in sources if source.scheme() == "file"] == [CONF]
 
@@ -90,6 +120,11 @@ class _Read(ConfigResult):
     def __init__(self, result: ConfigResult) -> None:
         self.__dict__.update(vars(result), settings=pickle.dumps(result.config))
         del self.config
+
+    def again(self) -> _Read:
+        new = object.__new__(_Read)
+        new.__dict__.update(self.__dict__)
+        return new
 
     def __getattr__(self, name: str) -> Any:
         if name != "config" or "settings" not in self.__dict__:
@@ -108,7 +143,7 @@ def _read_once(read: Callable) -> Callable:
         if config_path not in known:
             found = read(self, config_path=config_path)
             known[config_path] = None if found is None else _Read(found)
-        return copy.copy(known[config_path])
+        return known[config_path] and known[config_path].again()
 
     return called
 

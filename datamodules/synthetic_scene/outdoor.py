@@ -20,7 +20,7 @@ from heatsplat.datamodules.synthetic_scene.outdoor_heat import History, OutdoorM
 from heatsplat.datamodules.synthetic_scene.outdoor_sky import DURATION_S, forcing_of, outdoor_weather, part_of
 from heatsplat.datamodules.synthetic_scene.paths import looking
 from heatsplat.datamodules.synthetic_scene.presets import Pattern, Preset, Surface
-from heatsplat.datamodules.synthetic_scene.scene import Scene
+from heatsplat.datamodules.synthetic_scene.scene import Scene, by_surface
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Plane
 from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C
 from heatsplat.training.rng import generator_for
@@ -193,14 +193,10 @@ class OutdoorScene(Scene):
         """Face and absorptivity at ``points`` [n, 3] that lie on the surfaces numbered ``which`` [n] (-1: none)."""
         face = torch.full((len(points),), -1)
         absorptivity = torch.zeros(len(points), dtype=torch.float64)
-        for number, surface in enumerate(self.preset.surfaces):
-            here = which == number
-            if not here.any():
-                continue
-            on = points[here]
-            own = (self.face_surface == number).nonzero()[:, 0]
-            face[here] = own[(surface.shape.normals(on) @ self.face_normals[own].T).argmax(1)]
-            absorptivity[here] = surface.absorbs(surface.shape.local(on)).clamp(0.0, 1.0)
+        for part in by_surface(self.preset.surfaces, points, which):
+            own = (self.face_surface == part.number).nonzero()[:, 0]
+            face[part.here] = own[(part.normals @ self.face_normals[own].T).argmax(1)]
+            absorptivity[part.here] = part.absorbs
         return OutdoorHeat(face, absorptivity)
 
     def celsius(self, heat: OutdoorHeat, times_s: Tensor) -> Tensor:  # type: ignore[override]

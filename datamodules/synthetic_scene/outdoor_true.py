@@ -31,6 +31,7 @@ from heatsplat.datamodules.synthetic_scene.outdoor_sky import (
     outdoor_weather,
 )
 from heatsplat.datamodules.synthetic_scene.presets import Surface
+from heatsplat.datamodules.synthetic_scene.scene import by_surface
 from heatsplat.datamodules.synthetic_scene.yard_light import Lighting
 from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C, STEFAN_BOLTZMANN
 
@@ -95,16 +96,12 @@ class OutdoorTrueScene(OutdoorScene):
         """The patches about ``points`` [n, 3] that lie on the surfaces numbered ``which`` [n] (-1: none)."""
         patches = torch.zeros(len(points), 4, dtype=torch.int64)
         weights = torch.zeros(len(points), 4, dtype=torch.float64)
-        for number, surface in enumerate(self.preset.surfaces):
-            here = (which == number).nonzero()[:, 0]
-            if not len(here):
-                continue
-            on = points[here]
-            own = [face for face in self.light.faces if face.surface == number]
-            nearest = (surface.shape.normals(on) @ torch.stack([face.normal for face in own]).T).argmax(1)
+        for part in by_surface(self.preset.surfaces, points, which):
+            own = [face for face in self.light.faces if face.surface == part.number]
+            nearest = (part.normals @ torch.stack([face.normal for face in own]).T).argmax(1)
             for k, face in enumerate(own):
                 ids = (nearest == k).nonzero()[:, 0]
-                patches[here[ids]], weights[here[ids]] = face.corners(on[ids])
+                patches[part.here[ids]], weights[part.here[ids]] = face.corners(part.on[ids])
         return PatchHeat(patches, weights)
 
     def celsius(self, heat: PatchHeat, times_s: Tensor) -> Tensor:  # type: ignore[override]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -22,6 +23,16 @@ from heatsplat.datamodules.synthetic_scene.shapes import Box, Cylinder, Plane, P
 # Directions (cycles per wavelength) and phases of the smooth part of every pattern: three waves that share no axis.
 _WAVES = ((0.83, 0.31, 0.46), (-0.37, 0.78, 0.51), (0.29, -0.55, 0.78))
 _PHASES = (0.4, 2.1, 4.4)
+
+
+@cache  # small tensors take as long to make as to compute with
+def _waves(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    return torch.tensor(_WAVES, dtype=dtype), torch.tensor(_PHASES, dtype=dtype)
+
+
+def _sum(values: Tensor) -> Tensor:
+    """Sums [n] of rows [n, 3]; several times faster than a sum over a short axis."""
+    return values[:, 0] + values[:, 1] + values[:, 2]
 
 
 @dataclass(frozen=True)
@@ -49,15 +60,16 @@ class Pattern:
         """Values [n] at ``points`` [n, 3]."""
         value = torch.full_like(points[:, 0], self.level)
         if self.swing:
-            value += self.waves(points).sum(1)
+            value += _sum(self.waves(points))
         if self.step:
-            tile = (points.T / self.tile_m + 0.5).floor().sum(0)
+            tile = _sum((points / self.tile_m + 0.5).floor())
             value += self.step * (1.0 - 2.0 * torch.remainder(tile, 2.0))
         return value
 
     def waves(self, points: Tensor) -> Tensor:
         """The parts [n, 3] of the smooth part at ``points`` [n, 3], each a plane wave."""
-        phases = points @ points.new_tensor(_WAVES).T * (2.0 * math.pi / self.wavelength_m) + points.new_tensor(_PHASES)
+        waves, starts = _waves(points.dtype)
+        phases = points @ waves.T * (2.0 * math.pi / self.wavelength_m) + starts
         return self.swing / len(_WAVES) * torch.sin(phases)
 
     def wave_numbers(self, normals: Tensor) -> Tensor:

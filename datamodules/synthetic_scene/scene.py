@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -51,6 +53,54 @@ class SurfaceHeat:
     def where(self, keep: Tensor) -> SurfaceHeat:
         """The heat of the points that ``keep`` selects."""
         return SurfaceHeat(*(None if values is None else values[keep] for values in vars(self).values()))
+
+
+class OnSurface:
+    """Points of a scene that lie on one of its surfaces.
+
+    Attributes:
+        number, surface: which.
+        here: [m] positions among all points, increasing.
+        on: [m, 3] the points.
+    """
+
+    def __init__(self, number: int, surface: Surface, here: Tensor, points: Tensor) -> None:
+        self.number, self.surface, self.here, self.on = number, surface, here, points[here]
+
+    @cached_property
+    def local(self) -> Tensor:
+        """The points [m, 3] in the axes of the surface's shape."""
+        return self.surface.shape.local(self.on)
+
+    @cached_property
+    def normals(self) -> Tensor:
+        """Outward unit normals [m, 3]."""
+        return self.surface.shape.normals(self.on)
+
+    @cached_property
+    def absorbs(self) -> Tensor:
+        """Absorbed share [m] of light, in [0, 1]."""
+        return self.surface.absorbs(self.local).clamp(0.0, 1.0)
+
+
+_LAST = threading.local()  # of each thread that films: what it divided last
+
+
+def by_surface(surfaces: tuple[Surface, ...], points: Tensor, which: Tensor) -> list[OnSurface]:
+    """Points [n, 3] on the surfaces numbered ``which`` [n] (-1: none), by surface; surfaces without points are left out.
+
+    Points that are seen are asked for their colour and then for their heat, and divided once.
+    """
+    versions = points._version, which._version
+    last = getattr(_LAST, "asked", None)
+    if last and last[0] is surfaces and last[1] is points and last[2] is which and last[3] == versions:
+        return last[4]
+    order = which.argsort(stable=True)
+    counts = torch.bincount(which + 1, minlength=len(surfaces) + 1).tolist()
+    of_each = enumerate(zip(surfaces, order.split(counts)[1:], strict=True))
+    found = [OnSurface(number, surface, here, points) for number, (surface, here) in of_each if len(here)]
+    _LAST.asked = surfaces, points, which, versions, found
+    return found
 
 
 class Scene:
@@ -103,10 +153,8 @@ class Scene:
     def normals(self, points: Tensor, which: Tensor) -> Tensor:
         """Outward unit normals [n, 3] at ``points`` [n, 3] on the surfaces numbered ``which`` [n]; 0 where there is none."""
         result = torch.zeros_like(points)
-        for number, shape in enumerate(self.shapes):
-            here = (which == number).nonzero()[:, 0]
-            if len(here):
-                result[here] = shape.normals(points[here])
+        for part in by_surface(self.preset.surfaces, points, which):
+            result[part.here] = part.normals
         return result
 
     def heat_at(self, points: Tensor, which: Tensor) -> SurfaceHeat:
@@ -118,26 +166,21 @@ class Scene:
             *((points.new_zeros(len(points), 3), points.new_zeros(len(points), 3)) if self.preset.diffusivity else ()),
         )
         normals, reaching = torch.zeros_like(points), torch.zeros_like(result.flux_w_m2)
-        for number, surface in enumerate(self.preset.surfaces):
-            here = (which == number).nonzero()[:, 0]
-            if not len(here):
-                continue
-            on = points[here]
-            local = surface.shape.local(on)
+        for part in by_surface(self.preset.surfaces, points, which):
+            surface, here, on, local = part.surface, part.here, part.on, part.local
             result.material[here] = self.materials.index(surface.material)
             if surface.name in self.preset.start_k:
                 start = self.preset.start_k[surface.name]
                 result.start_k[here] = start(local)
                 if self.preset.diffusivity:
-                    across = surface.shape.local(on + surface.shape.normals(on)) - local
+                    across = surface.shape.local(on + part.normals) - local
                     result.waves_k[here] = start.waves(local)
                     result.levelling[here] = self.preset.diffusivity * start.wave_numbers(across) ** 2
             if self.preset.held:
                 result.flux_w_m2[here] = surface.material.exchange * result.start_k[here]
             if self.preset.lamp:
-                facing = surface.shape.normals(on)
-                normals[here], reaching[here] = facing, self._lamp_flux(on, facing)
-                result.flux_w_m2[here] = surface.absorbs(local).clamp(0.0, 1.0) * reaching[here]
+                normals[here], reaching[here] = part.normals, self._lamp_flux(on, part.normals)
+                result.flux_w_m2[here] = part.absorbs * reaching[here]
         if self.preset.lamp:  # one look for shadows from all surfaces
             lit = (reaching > 0).nonzero()[:, 0]
             to_lamp = points.new_tensor(self.preset.lamp.position) - points[lit]
@@ -280,15 +323,11 @@ class Scene:
 
     def color(self, points: Tensor, which: Tensor) -> Tensor:
         """Colour [n, 3] in [0, 1] that surface points reflect: Lambertian, dark where the paint absorbs heat."""
-        color = torch.zeros_like(points)
-        for number, surface in enumerate(self.preset.surfaces):
-            here = (which == number).nonzero()[:, 0]
-            if not len(here):
-                continue
-            on = points[here]
-            daylight = _SKYLIGHT + (1 - _SKYLIGHT) * (surface.shape.normals(on) @ on.new_tensor(_SUN)).clamp_min(0.0)
-            albedo = 1 - (1 - _DARKEST) * surface.absorbs(surface.shape.local(on)).clamp(0.0, 1.0)
-            color[here] = (albedo * daylight)[:, None] * on.new_tensor(surface.color)
+        color, sun = torch.zeros_like(points), points.new_tensor(_SUN)
+        for part in by_surface(self.preset.surfaces, points, which):
+            daylight = _SKYLIGHT + (1 - _SKYLIGHT) * (part.normals @ sun).clamp_min(0.0)
+            albedo = 1 - (1 - _DARKEST) * part.absorbs
+            color[part.here] = (albedo * daylight)[:, None] * points.new_tensor(part.surface.color)
         return color
 
     def visible(self, points: Tensor, which: Tensor, directions: Tensor) -> Tensor:

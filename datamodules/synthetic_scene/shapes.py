@@ -23,6 +23,9 @@ from torch import Tensor
 
 Point = tuple[float, float, float]
 
+# Rays times shapes that are asked at once whether they are near each other: what stays in a core's own memory.
+_AT_ONCE = 2**16
+
 
 class Shape(Protocol):
     """What the tracer needs of a shape; the module's first lines say what each method returns."""
@@ -52,6 +55,13 @@ def _turn(yaw_deg: float, tilt_deg: float) -> Tensor:
         return yaw
     c, s = math.cos(math.radians(tilt_deg)), math.sin(math.radians(tilt_deg))
     return yaw @ torch.tensor([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]], dtype=torch.float64)
+
+
+@cache
+def _spheres(bounds: tuple[tuple[Point, float], ...]) -> tuple[Tensor, Tensor]:
+    """Centres [n, 3] and radii [n, 1]."""
+    centers, radii = zip(*bounds, strict=True)
+    return torch.tensor(centers, dtype=torch.float64), torch.tensor(radii, dtype=torch.float64)[:, None]
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -249,28 +259,45 @@ def trace(shapes: Sequence[Shape], origins: Tensor, directions: Tensor) -> tuple
     """
     nearest = torch.full_like(directions[:, 0], math.inf)
     which = torch.zeros_like(nearest, dtype=torch.int64)
-    lengths = dot(directions, directions)
+    near = _near(shapes, origins, directions)
     for position, shape in enumerate(shapes):
-        bounds = shape.bounds()
-        if bounds is None:
+        if position not in near:
             distance = shape.intersect(origins, directions)
             closer = distance < nearest
             nearest = torch.where(closer, distance, nearest)
             which.masked_fill_(closer, position)
             continue
-        # Few rays come near a given object; the others need not ask it.
-        center, radius = bounds
-        offset = origins - _row(center)
-        outside = dot(offset, offset) - (1.0 + 1e-9) * radius**2
-        along = dot(directions, offset)
-        near = ((along * along >= lengths * outside) & ((along < 0) | (outside < 0))).nonzero()[:, 0]
-        if not len(near):
+        rays = near[position]
+        if not len(rays):
             continue
-        distance = shape.intersect(origins if len(origins) == 1 else origins[near], directions[near])
-        closer = (distance < nearest[near]).nonzero()[:, 0]
-        nearest[near[closer]] = distance[closer]
-        which[near[closer]] = position
+        distance = shape.intersect(origins if len(origins) == 1 else origins[rays], directions[rays])
+        closer = (distance < nearest[rays]).nonzero()[:, 0]
+        rays = rays[closer]
+        nearest[rays] = distance[closer]
+        which[rays] = position
     return nearest, which
+
+
+def _near(shapes: Sequence[Shape], origins: Tensor, directions: Tensor) -> dict[int, Tensor]:
+    """Which rays come near each of the shapes that have bounds, by their positions; the others need not ask it.
+
+    Of small images so many shapes at once that fewer and longer operations pay.
+    """
+    bounded = [(position, bounds) for position, shape in enumerate(shapes) if (bounds := shape.bounds()) is not None]
+    lengths, rays = dot(directions, directions), directions.unbind(1)
+    near: dict[int, Tensor] = {}
+    at_once = max(1, _AT_ONCE // max(1, len(directions)))
+    for first in range(0, len(bounded), at_once):
+        some, bounds = zip(*bounded[first : first + at_once], strict=True)
+        centers, radii = _spheres(bounds)
+        x, y, z = (origins[:, axis] - centers[:, axis, None] for axis in range(3))
+        outside = x * x + y * y + z * z - (1.0 + 1e-9) * radii**2
+        along = rays[0] * x + rays[1] * y + rays[2] * z
+        found = (along * along >= lengths * outside) & ((along < 0) | (outside < 0))
+        number, ray = found.nonzero().unbind(1)
+        counts = torch.bincount(number, minlength=len(some)).tolist()
+        near |= zip(some, ray.contiguous().split(counts), strict=True)
+    return near
 
 
 def nearest_surface(shapes: Sequence[Shape], points: Tensor) -> tuple[Tensor, Tensor]:

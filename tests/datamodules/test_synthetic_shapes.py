@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from heatsplat.datamodules.synthetic_scene import shapes as synthetic_shapes
 from heatsplat.datamodules.synthetic_scene.presets import TABLE_TOP
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Cylinder, Plane, Sphere, nearest_surface, trace
 
@@ -120,8 +121,10 @@ def test_nothing_behind_the_origin_is_hit():
         assert torch.isinf(shape.intersect(past, directions[met])).all()
 
 
-def test_trace_returns_the_nearest_shape_and_skips_none():
+@pytest.mark.parametrize("at_once", [1, 15_000, 2**16])
+def test_trace_returns_the_nearest_shape_and_skips_none(monkeypatch, at_once):
     """The tracer asks a shape only about rays that come near it; asking about all must give the same."""
+    monkeypatch.setattr(synthetic_shapes, "_AT_ONCE", at_once)
     shapes = [surface.shape for surface in TABLE_TOP]
     generator = torch.Generator().manual_seed(5)
     origins = torch.rand(5000, 3, generator=generator, dtype=torch.float64) * torch.tensor(

@@ -14,6 +14,7 @@ import numba
 import numpy as np
 import pytest
 from commands import SOURCES, forking, succeeds
+from numba.core.postproc import PostProcessor
 from numba.misc import appdirs
 
 from heatsplat.kernels import compilation
@@ -414,3 +415,27 @@ def test_nobody_looks_for_garbage_while_the_compiler_works(monkeypatch, collects
 def noting(notes: list[bool], passes: list) -> list:
     notes.append(gc.isenabled())
     return passes
+
+
+def doubled_within(numbers):
+    def twice(number):
+        return 2.0 * number
+
+    for k in range(numbers.shape[0]):
+        numbers[k] = twice(numbers[k])
+
+
+@pytest.mark.parametrize(("function", "looks_for_functions"), [(double, False), (doubled_within, True)])
+def test_passes_run_where_they_have_something_to_do(monkeypatch, function, looks_for_functions):
+    """What is alive where is found out for those that have to know it, and not after each."""
+    steps, asked, passes, run = [], [], compilation._passes, PostProcessor.run
+    monkeypatch.setattr(compilation, "_passes", lambda state: steps.append(passes(state)) or steps[-1])
+    monkeypatch.setattr(
+        PostProcessor, "run", lambda self, *options, **named: asked.append(1) or run(self, *options, **named)
+    )
+    numbers = np.arange(5.0)
+    numba.njit(pipeline_class=compilation._Compiler)(function)(numbers)
+    np.testing.assert_array_equal(numbers, 2 * np.arange(5.0))
+    names = [step.__name__ for step, _ in steps[0]]
+    assert ("InlineClosureLikes" in names) == looks_for_functions and "NopythonRewrites" not in names
+    assert looks_for_functions or len(asked) < len(names) / 2
