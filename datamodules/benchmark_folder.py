@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ from plyfile import PlyData, PlyElement
 
 from heatsplat.contracts import SceneData, SceneError, View
 from heatsplat.datamodules.base import SceneDataModule
-from heatsplat.datamodules.formats.colmap import write_model
+from heatsplat.datamodules.formats.colmap import pinholes, write_model
 from heatsplat.datamodules.posed_frames import FILES
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.weather_table import write_weather
@@ -91,10 +92,17 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
         prefix: what names of test views get, where they do not begin with the part that they belong to.
 
     Raises:
-        SceneError: its images are no temperatures.
+        SceneError: its images are no temperatures, or two would have one file.
     """
     if scene.thermal_range is None:
         raise SceneError(f"scene {scene.name} has no temperatures, and the protocol scores °C")
+    for views in (scene.train, scene.test):
+        stems = Counter(Path(frame.name).stem for frame in views.frames)
+        if twice := [frame.name for frame in views.frames if stems[Path(frame.name).stem] > 1]:
+            raise SceneError(
+                f"images of scene {scene.name} such as {twice[0]} and {twice[1]} have one name in several folders, and would be "
+                "one file of the protocol; give them names of their own"
+            )
     clock = None if scene.weather is None else scene.weather.notes.get("utc_at_zero_s")
     for subset, views in (("train", scene.train), ("test", scene.test)):
         frames = []
@@ -115,10 +123,10 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
     colors = np.full_like(points, 0.5) if scene.point_colors is None else scene.point_colors.double().numpy()
     colors = (colors * 255.0).round().astype(np.uint8)
     _ply(folder / "points3D.ply", points, colors)
-    first = scene.train.frames[0].camera
-    lens = ("PINHOLE", [float(first.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))], first.width, first.height)
-    poses = {f"{Path(frame.name).stem}.tiff": frame.camera.viewmat.numpy() for frame in scene.train.frames}
-    write_model(folder / "sparse" / "0", poses, [lens], points, colors)
+    cameras = {f"{Path(frame.name).stem}.tiff": frame.camera for frame in scene.train.frames}
+    kinds, camera_of = pinholes(cameras)
+    poses = {name: camera.viewmat.numpy() for name, camera in cameras.items()}
+    write_model(folder / "sparse" / "0", poses, kinds, points, colors, camera_of=camera_of)
     if scene.labels is not None:
         np.save(folder / "labels.npy", scene.labels.numpy())
     meta = {

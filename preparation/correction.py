@@ -23,7 +23,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera, SceneData, SceneError, View, ViewSet, check_numbers
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.file_names import stem_of
-from heatsplat.datamodules.formats.colmap import write_model
+from heatsplat.datamodules.formats.colmap import pinholes, write_model
 from heatsplat.datamodules.side_files import read_table
 from heatsplat.export.place import placed, unit_in_metres
 from heatsplat.geometry.sight_lines import cosines, distances, normals
@@ -462,16 +462,11 @@ def preparation_of(name: str, folders: Sequence[Path]) -> tuple[Response | None,
 
 
 def _write_cameras(target: Path, scene: SceneData, cameras: Mapping[str, Camera]) -> None:
-    kinds: dict[tuple, int] = {}
-    camera_of = {}
-    for name, camera in cameras.items():
-        k = camera.K.tolist()
-        kind = ("PINHOLE", (k[0][0], k[1][1], k[0][2], k[1][2]), camera.width, camera.height)
-        camera_of[name] = kinds.setdefault(kind, len(kinds))
+    kinds, camera_of = pinholes(cameras)
     poses = {name: camera.viewmat.double().numpy() for name, camera in cameras.items()}
     colours = scene.point_colors if scene.point_colors is not None else torch.full((len(scene.points), 3), 0.5)
     points = scene.points.double().numpy()
-    write_model(target / "sparse" / "0", poses, list(kinds), points, _bytes(colours), camera_of=camera_of)
+    write_model(target / "sparse" / "0", poses, kinds, points, _bytes(colours), camera_of=camera_of)
 
 
 def _bytes(colours: Tensor) -> np.ndarray:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
@@ -43,6 +45,7 @@ SOURCES = ("thermal", "rgb")
 FEW_FEATURES = 60
 STILL_PX = 0.5  # median motion of the image between frames below which the camera stands still
 PAIRS_AT_ONCE = 20
+HEIGHTS = ("above_takeoff_m", "altitude_m")  # of positions
 
 
 @dataclass(frozen=True)
@@ -410,7 +413,7 @@ class Search:
         """Latitude, longitude and altitude of the first fix; None where GPS does not count or cannot tell frames apart."""
         if not self.options.gps:
             return None
-        fixes = [_fix(frame) for frame in self.frames.values()]
+        fixes = [self._fix(frame) for frame in self.frames.values()]
         known = np.array([fix for fix in fixes if fix is not None])
         if len(known) < 3:
             return None
@@ -421,13 +424,31 @@ class Search:
             return None
         return known[0]
 
+    @cached_property
+    def _height(self) -> str | None:
+        """Which height of positions counts, one for all: above take-off, the better zero, unless more frames tell that above the
+        sea. None where none tells any."""
+        told = Counter(
+            name
+            for f in self.frames.values()
+            for name in HEIGHTS
+            if f.position and getattr(f.position, name) is not None
+        )
+        return max(HEIGHTS, key=told.__getitem__) if told else None
+
+    def _fix(self, frame: ThermalFrame) -> tuple[float, float, float] | None:
+        """Latitude, longitude and height of a frame; None without a position, or without the height that others have."""
+        at = frame.position
+        height = None if at is None else 0.0 if self._height is None else getattr(at, self._height)
+        return None if height is None else (at.latitude_deg, at.longitude_deg, height)
+
     def _sd(self, frame: ThermalFrame) -> tuple[float, float]:
         position, (across, up) = frame.position, self.options.gps_sd_m
         return position.horizontal_sd_m or across, position.vertical_sd_m or up
 
     def _places(self, names: Sequence[str]) -> np.ndarray | None:
         """Metres [n, 3] of the frames by GPS; None where it does not count or one lacks it."""
-        fixes = [_fix(self.frames[name]) for name in names]
+        fixes = [self._fix(self.frames[name]) for name in names]
         if self.origin is None or any(fix is None for fix in fixes):
             return None
         return east_north_up(np.array(fixes), self.origin)
@@ -444,7 +465,7 @@ class Search:
                     if image.name.startswith("rgb/")
                     else None
                 )
-            fix = None if name is None else _fix(self.frames[name])
+            fix = None if name is None else self._fix(self.frames[name])
             if fix is None:
                 continue
             across, up = self._sd(self.frames[name])
@@ -461,7 +482,7 @@ class Search:
         """Root mean square of how far cameras lie from their fixes: horizontally and vertically, in metres."""
         if self.origin is None:
             return None
-        known = [(image, fix) for image in placed if (fix := _fix(self.frames[image.name])) is not None]
+        known = [(image, fix) for image in placed if (fix := self._fix(self.frames[image.name])) is not None]
         found = np.array([image.projection_center() for image, _ in known])
         away = found - east_north_up(np.array([fix for _, fix in known]), self.origin)
         return np.sqrt(np.array([(away[:, :2] ** 2).sum(1).mean(), (away[:, 2] ** 2).mean()]))
@@ -540,15 +561,6 @@ def put_whole(fresh: Path, folder: Path) -> None:
 def _apparent(frame: ThermalFrame) -> ThermalFrame:
     """The frame as the camera saw it: where cameras stand does not depend on emissivity, air and window."""
     return replace(frame, conditions=Conditions(), sources={})
-
-
-def _fix(frame: ThermalFrame) -> tuple[float, float, float] | None:
-    """Latitude, longitude and altitude of a frame; where take-off is the better zero, above it."""
-    at = frame.position
-    if at is None:
-        return None
-    height = at.above_takeoff_m if at.above_takeoff_m is not None else at.altitude_m
-    return at.latitude_deg, at.longitude_deg, 0.0 if height is None else height
 
 
 def _shape(path: Path) -> tuple[int, int]:

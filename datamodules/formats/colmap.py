@@ -11,7 +11,7 @@ import cv2  # noqa: F401, I001
 import numpy as np
 import pycolmap
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import Camera, SceneError
 from heatsplat.datamodules.formats.colmap_records import check_records
 from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 
@@ -91,6 +91,19 @@ def read_model(scene: Path) -> SparseModel:
 def pose_matrix(image: pycolmap.Image) -> np.ndarray:
     """World to camera [4, 4] float64 of an image that has a pose, OpenCV axes."""
     return np.vstack([image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]])
+
+
+def pinholes(
+    cameras: Mapping[str, Camera],
+) -> tuple[list[tuple[str, tuple[float, ...], int, int]], dict[str, int]]:
+    """Cameras without distortion by image name as ``write_model`` takes them: each lens once, and which one an image has."""
+    kinds: dict[tuple, int] = {}
+    camera_of = {}
+    for name, camera in cameras.items():
+        k = camera.K.tolist()
+        kind = ("PINHOLE", (k[0][0], k[1][1], k[0][2], k[1][2]), camera.width, camera.height)
+        camera_of[name] = kinds.setdefault(kind, len(kinds))
+    return list(kinds), camera_of
 
 
 def write_model(

@@ -2,11 +2,13 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, ViewSet
 from heatsplat.datamodules.benchmark_folder import write_scene, write_scenes
 from heatsplat.datamodules.formats.colmap import read_model
 from heatsplat.datamodules.formats.images import read_image
@@ -97,3 +99,27 @@ def test_what_is_there_stays_and_another_size_is_refused(root, tmp_path):
     without = replace(Synthetic(scene="static", size="tiny", frames=4).scene, thermal_range=None)
     with pytest.raises(SceneError, match="scene static has no temperatures"):
         write_scene(without, tmp_path / "scene", tmp_path / "truth", {})
+
+
+def test_images_of_several_cameras_keep_their_lenses(tmp_path):
+    scene = Synthetic(scene="cooling", size="tiny").scene
+    other = replace(
+        scene.train.frames[1].camera, K=scene.train.frames[1].camera.K * torch.tensor([[2.0], [1.0], [1.0]])
+    )
+    frames = [replace(frame, camera=other) if i == 1 else frame for i, frame in enumerate(scene.train.frames)]
+    train = ViewSet(frames, lambda i: replace(scene.train[i], frame=frames[i]))
+    write_scene(replace(scene, train=train), tmp_path / "scene", tmp_path / "truth", {})
+    model = read_model(tmp_path / "scene")
+    lenses = dict(zip(model.names, model.lenses, strict=True))
+    for frame in frames:
+        lens = lenses[f"{Path(frame.name).stem}.tiff"]
+        assert np.allclose(lens.matrix(), frame.camera.K.numpy())
+
+
+def test_images_of_one_name_are_refused(tmp_path):
+    scene = Synthetic(scene="cooling", size="tiny").scene
+    frames = [replace(frame, name=f"{'ab'[i % 2]}/{i // 2}.png") for i, frame in enumerate(scene.train.frames)]
+    train = ViewSet(frames, lambda i: replace(scene.train[i], frame=frames[i]))
+    with pytest.raises(SceneError, match="such as a/0.png and b/0.png have one name in several folders"):
+        write_scene(replace(scene, train=train), tmp_path / "scene", tmp_path / "truth", {})
+    assert not list(tmp_path.iterdir())

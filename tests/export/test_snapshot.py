@@ -56,8 +56,9 @@ def test_a_static_scene_has_one_moment_and_what_cannot_be_seen_is_left_out(tmp_p
     module = started(tmp_path, "method=3dgs", "data.scene=static")
     with torch.no_grad():
         module.splats.raw["opacity_logits"][:5] = -20.0
+        module.splats.raw["quats"][5] = 0.0
     seen = snapshot(module)
-    assert len(seen.means) == len(module.splats) - 5
+    assert len(seen.means) == len(module.splats) - 6 and bool(seen.quats.any(1).all())
     assert seen.layers[0].basis.rank == 0 and seen.left_out == []
 
 

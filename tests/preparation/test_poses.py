@@ -1,6 +1,7 @@
 """Cameras that are found from thermal frames alone, against those that filmed them."""
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -40,6 +41,25 @@ def search_of(tmp_path: Path, frames: int, **options) -> Search:
             )
         )
     return Search(FindPoses(Sift(), **options), found, tmp_path)
+
+
+def test_heights_of_all_frames_have_one_zero(tmp_path):
+    """A file may lack one of the two: metres above take-off beside metres above the sea would be a cliff."""
+    search = search_of(tmp_path, 5)
+    names = list(search.frames)
+
+    def heights(*told: tuple[float | None, float | None]) -> list[float | None]:
+        for i, (sea, takeoff) in enumerate(told):
+            position = Position(51.0 + 1e-4 * i, 4.0, sea, takeoff)
+            search.frames[names[i]] = replace(search.frames[names[i]], position=position)
+        search.__dict__.pop("_height", None)
+        fixes = [search._fix(search.frames[name]) for name in names]
+        return [fix and fix[2] for fix in fixes]
+
+    assert heights(*[(575.0, 75.0)] * 5) == [75.0] * 5
+    assert heights(*[(575.0, 75.0)] * 4, (575.0, None)) == [575.0] * 5
+    assert heights(*[(None, 75.0)] * 4, (575.0, None)) == [75.0] * 4 + [None]
+    assert heights(*[(None, None)] * 5) == [0.0] * 5
 
 
 def test_few_frames_are_all_matched_and_a_video_only_with_its_neighbours(tmp_path):

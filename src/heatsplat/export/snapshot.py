@@ -172,7 +172,8 @@ class _Visible:
         self._free_id = first_free_id(self.scene)
         self.frame = self._at(train.frames[0], self.middle)
         means, quats, scales, opacities = module.shapes(self.frame)
-        self.kept = ((opacities.amax(0) >= ALPHA_MIN) & means.isfinite().all(1)).nonzero()[:, 0]
+        seen = (opacities.amax(0) >= ALPHA_MIN) & means.isfinite().all(1) & quats.any(1)  # as renderers have it
+        self.kept = seen.nonzero()[:, 0]
         if not len(self.kept):
             raise SceneError(
                 f"none of the {len(means)} Gaussians of scene '{self.scene.name}' can be seen (opacities are below "
