@@ -112,6 +112,18 @@ def time_in(transforms: Transforms, frame: dict[str, Any]) -> float | None:
         ) from error
 
 
+def _focal(values: dict[str, Any], axis: str, pixels: int, source: str) -> float | None:
+    """Focal length along "x" or "y" in pixels, of an image with so many of them there; None where nothing tells it."""
+    if (key := f"fl_{axis}") in values:
+        return finite(values[key], f"{source}: {key}")
+    if (key := f"camera_angle_{axis}") not in values:
+        return None
+    angle = finite(values[key], f"{source}: {key}")
+    if not 0 < angle < math.pi:
+        raise SceneError(f"{source}: {key} is {angle:g}, the field of view in radians (0 to pi) is needed")
+    return 0.5 * pixels / math.tan(0.5 * angle)
+
+
 def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tuple[int, int]]) -> Lens:
     """The lens of a frame, from its own keys or those of the file.
 
@@ -136,15 +148,16 @@ def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tu
         return finite(values.get(key, default), f"{source}: {key}")
 
     width, height = (int(number("w")), int(number("h"))) if "w" in values and "h" in values else size()
-    if "fl_x" in values:
-        fx = number("fl_x")
-    elif "camera_angle_x" in values:
-        angle = number("camera_angle_x")
-        if not 0 < angle < math.pi:
-            raise SceneError(f"{source}: camera_angle_x is {angle:g}, the field of view in radians (0 to pi) is needed")
-        fx = 0.5 * width / math.tan(0.5 * angle)
-    else:
+    fx = _focal(values, "x", width, source)
+    if fx is None:
         raise SceneError(f"{source}: no focal length; fl_x or camera_angle_x is needed")
-    known = {"f": fx, "fx": fx, "fy": number("fl_y", fx), "cx": number("cx", width / 2), "cy": number("cy", height / 2)}
+    fy = _focal(values, "y", height, source)
+    known = {
+        "f": fx,
+        "fx": fx,
+        "fy": fx if fy is None else fy,
+        "cx": number("cx", width / 2),
+        "cy": number("cy", height / 2),
+    }
     params = [known[key] if key in known else number(key) for key in MODELS[model].split()]
     return lens_of(model, params, width, height, source)

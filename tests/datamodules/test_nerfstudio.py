@@ -117,6 +117,23 @@ def test_instant_ngp_and_blender_files(tmp_path, test):
     assert scene.train[0].thermal is None and scene.train[0].rgb is not None
 
 
+def test_fields_of_view_tell_both_focal_lengths(tmp_path):
+    for i in range(9):
+        write_image(tmp_path / f"{i}.png", photo(i))
+    frames = [{"file_path": f"{i}.png"} for i in range(9)]
+    for given, (fx, fy) in (
+        ({"camera_angle_x": 0.7, "camera_angle_y": 0.5}, (0.5 * WIDTH / np.tan(0.35), 0.5 * HEIGHT / np.tan(0.25))),
+        ({"fl_x": 50.0, "camera_angle_y": 0.5}, (50.0, 0.5 * HEIGHT / np.tan(0.25))),
+        ({"camera_angle_x": 0.7, "fl_y": 60.0, "camera_angle_y": 0.5}, (0.5 * WIDTH / np.tan(0.35), 60.0)),
+        ({"camera_angle_x": 0.7}, (0.5 * WIDTH / np.tan(0.35),) * 2),
+    ):
+        write_frames(tmp_path, frames)
+        values = json.loads((tmp_path / "transforms.json").read_text())
+        write_json(tmp_path / "transforms.json", {**given, "frames": values["frames"]})
+        K = loaded(tmp_path).train[0].camera.K
+        assert [float(K[0, 0]), float(K[1, 1])] == pytest.approx([fx, fy]), given
+
+
 def test_a_fisheye_of_instant_ngp_is_one(tmp_path):
     """Its files name no camera model, only is_fisheye: the same k1 to k4 are those of another lens."""
     coefficients = {"k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": -0.001}
