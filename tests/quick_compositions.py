@@ -48,6 +48,7 @@ def quick_compositions() -> Iterator[None]:
         (config_loader_impl, "create_defaults_list", _listed_once(defaults_list.create_defaults_list)),
         (OverridesParser, "parse_rule", _parsed_once(OverridesParser.parse_rule)),
         (HydraConfig, "set_config", _set_config),
+        (ConfigRepository, "_find_object_source", _found_once(ConfigRepository._find_object_source)),
         (omegaconf.base.Box, "_re_parent", _re_parent),
         (defaults_list, "_create_interpolation_map", _where_needed(defaults_list._create_interpolation_map)),
         (version, "_get_version", functools.cache(version._get_version)),  # asked for eight hundred times
@@ -146,6 +147,22 @@ def _read_once(read: Callable) -> Callable:
         return known[config_path] and known[config_path].again()
 
     return called
+
+
+def _found_once(find: Callable) -> Callable:
+    """Where a file or a group is; most groups are looked for in two places, dozens of times for each composition."""
+    known: dict[Any, int | None] = {}
+
+    def found(self, config_path, object_type):
+        if not _ours(self.sources):
+            return find(self, config_path, object_type)
+        key = config_path, object_type, tuple(source.path for source in self.sources)
+        if key not in known:
+            source = find(self, config_path, object_type)
+            known[key] = None if source is None else self.sources.index(source)
+        return None if known[key] is None else self.sources[known[key]]
+
+    return found
 
 
 def _once(function: Callable, about: Callable) -> Callable:

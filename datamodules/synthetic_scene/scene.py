@@ -91,15 +91,17 @@ def by_surface(surfaces: tuple[Surface, ...], points: Tensor, which: Tensor) -> 
 
     Points that are seen are asked for their colour and then for their heat, and divided once.
     """
-    versions = points._version, which._version
+    kept = not (points.is_inference() or which.is_inference())  # nobody knows whether those were changed
+    versions = (points._version, which._version) if kept else None
     last = getattr(_LAST, "asked", None)
-    if last and last[0] is surfaces and last[1] is points and last[2] is which and last[3] == versions:
+    if kept and last and last[0] is surfaces and last[1] is points and last[2] is which and last[3] == versions:
         return last[4]
     order = which.argsort(stable=True)
     counts = torch.bincount(which + 1, minlength=len(surfaces) + 1).tolist()
     of_each = enumerate(zip(surfaces, order.split(counts)[1:], strict=True))
     found = [OnSurface(number, surface, here, points) for number, (surface, here) in of_each if len(here)]
-    _LAST.asked = surfaces, points, which, versions, found
+    if kept:
+        _LAST.asked = surfaces, points, which, versions, found
     return found
 
 

@@ -198,6 +198,9 @@ def test_points_are_divided_among_surfaces_once_until_somebody_moves_them():
         of_all.copy_(of_all.flip(0))
     torch.testing.assert_close(scene.color(points, which), color.flip(0))
     torch.testing.assert_close(scene.heat_at(points, which).flux_w_m2, heat.flux_w_m2.flip(0))
+    with torch.inference_mode():  # in which a test of a run asks
+        moved = points.flip(0)
+        torch.testing.assert_close(scene.color(moved, which.flip(0)), color)
 
 
 def test_the_lamp_casts_shadows():
