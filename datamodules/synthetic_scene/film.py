@@ -253,8 +253,9 @@ def expose(scene: Scene, lens: Lens, rays: Tensor, viewmat: Tensor, time_s: floa
 
     def look(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         points, which = hits(scene, viewmat, directions)
-        color = scene.visible(points, which, directions @ viewmat[:3, :3])
-        celsius = scene.celsius(scene.heat_at(points, which), when)[:, 0]
+        parts = scene.parts(points, which)
+        color = scene.visible(points, which, directions @ viewmat[:3, :3], parts)
+        celsius = scene.celsius(scene.heat_at(points, which, parts), when)[:, 0]
         sight = torch.nn.functional.normalize(directions @ viewmat[:3, :3], dim=1)
         celsius = scene.apparent(celsius, points, which, sight, time_s)
         if haze:

@@ -20,7 +20,7 @@ from heatsplat.datamodules.synthetic_scene.outdoor_heat import History, OutdoorM
 from heatsplat.datamodules.synthetic_scene.outdoor_sky import DURATION_S, forcing_of, outdoor_weather, part_of
 from heatsplat.datamodules.synthetic_scene.paths import looking
 from heatsplat.datamodules.synthetic_scene.presets import Pattern, Preset, Surface
-from heatsplat.datamodules.synthetic_scene.scene import Scene, by_surface
+from heatsplat.datamodules.synthetic_scene.scene import OnSurface, Scene
 from heatsplat.datamodules.synthetic_scene.shapes import Box, Plane
 from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C
 from heatsplat.training.rng import generator_for
@@ -189,11 +189,13 @@ class OutdoorScene(Scene):
         """Temperatures of all faces in all their shades over time."""
         return _solved(self.preset.surfaces, self.preset.weather, self.preset.duration_s)
 
-    def heat_at(self, points: Tensor, which: Tensor) -> OutdoorHeat:  # type: ignore[override]
+    def heat_at(  # type: ignore[override]
+        self, points: Tensor, which: Tensor, parts: list[OnSurface] | None = None
+    ) -> OutdoorHeat:
         """Face and absorptivity at ``points`` [n, 3] that lie on the surfaces numbered ``which`` [n] (-1: none)."""
         face = torch.full((len(points),), -1)
         absorptivity = torch.zeros(len(points), dtype=torch.float64)
-        for part in by_surface(self.preset.surfaces, points, which):
+        for part in parts or self.parts(points, which):
             own = (self.face_surface == part.number).nonzero()[:, 0]
             face[part.here] = own[(part.normals @ self.face_normals[own].T).argmax(1)]
             absorptivity[part.here] = part.absorbs

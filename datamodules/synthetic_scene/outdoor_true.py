@@ -31,7 +31,7 @@ from heatsplat.datamodules.synthetic_scene.outdoor_sky import (
     outdoor_weather,
 )
 from heatsplat.datamodules.synthetic_scene.presets import Surface
-from heatsplat.datamodules.synthetic_scene.scene import by_surface
+from heatsplat.datamodules.synthetic_scene.scene import OnSurface
 from heatsplat.datamodules.synthetic_scene.yard_light import Lighting
 from heatsplat.physics.units import DAY_S, KELVIN_AT_0_C, STEFAN_BOLTZMANN
 
@@ -92,11 +92,13 @@ class OutdoorTrueScene(OutdoorScene):
         self.sky = sky_of(preset.weather, self.weather)
         self.emissivity = torch.tensor([*(body.emissivity for body in self.materials), 1.0], dtype=torch.float64)
 
-    def heat_at(self, points: Tensor, which: Tensor) -> PatchHeat:  # type: ignore[override]
+    def heat_at(  # type: ignore[override]
+        self, points: Tensor, which: Tensor, parts: list[OnSurface] | None = None
+    ) -> PatchHeat:
         """The patches about ``points`` [n, 3] that lie on the surfaces numbered ``which`` [n] (-1: none)."""
         patches = torch.zeros(len(points), 4, dtype=torch.int64)
         weights = torch.zeros(len(points), 4, dtype=torch.float64)
-        for part in by_surface(self.preset.surfaces, points, which):
+        for part in parts or self.parts(points, which):
             own = [face for face in self.light.faces if face.surface == part.number]
             nearest = (part.normals @ torch.stack([face.normal for face in own]).T).argmax(1)
             for k, face in enumerate(own):

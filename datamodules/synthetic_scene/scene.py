@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -83,28 +82,6 @@ class OnSurface:
         return self.surface.absorbs(self.local).clamp(0.0, 1.0)
 
 
-_LAST = threading.local()  # of each thread that films: what it divided last
-
-
-def by_surface(surfaces: tuple[Surface, ...], points: Tensor, which: Tensor) -> list[OnSurface]:
-    """Points [n, 3] on the surfaces numbered ``which`` [n] (-1: none), by surface; surfaces without points are left out.
-
-    Points that are seen are asked for their colour and then for their heat, and divided once.
-    """
-    kept = not (points.is_inference() or which.is_inference())  # nobody knows whether those were changed
-    versions = (points._version, which._version) if kept else None
-    last = getattr(_LAST, "asked", None)
-    if kept and last and last[0] is surfaces and last[1] is points and last[2] is which and last[3] == versions:
-        return last[4]
-    order = which.argsort(stable=True)
-    counts = torch.bincount(which + 1, minlength=len(surfaces) + 1).tolist()
-    of_each = enumerate(zip(surfaces, order.split(counts)[1:], strict=True))
-    found = [OnSurface(number, surface, here, points) for number, (surface, here) in of_each if len(here)]
-    if kept:
-        _LAST.asked = surfaces, points, which, versions, found
-    return found
-
-
 class Scene:
     """Geometry, materials and solved temperatures of a preset; float64 on the CPU.
 
@@ -152,14 +129,24 @@ class Scene:
         """What ``first_hits`` finds on rays that go on from surface points [n, 3] along ``directions`` [n, 3]."""
         return self.first_hits(points + _OFF_SURFACE_M * directions, directions)
 
-    def normals(self, points: Tensor, which: Tensor) -> Tensor:
+    def parts(self, points: Tensor, which: Tensor) -> list[OnSurface]:
+        """Points [n, 3] on the surfaces numbered ``which`` [n] (-1: none), by surface; surfaces without points are left out.
+
+        Who asks several things of the same points hands them on, and they are divided once.
+        """
+        order = which.argsort(stable=True)
+        counts = torch.bincount(which + 1, minlength=len(self.shapes) + 1).tolist()
+        of_each = enumerate(zip(self.preset.surfaces, order.split(counts)[1:], strict=True))
+        return [OnSurface(number, surface, here, points) for number, (surface, here) in of_each if len(here)]
+
+    def normals(self, points: Tensor, which: Tensor, parts: list[OnSurface] | None = None) -> Tensor:
         """Outward unit normals [n, 3] at ``points`` [n, 3] on the surfaces numbered ``which`` [n]; 0 where there is none."""
         result = torch.zeros_like(points)
-        for part in by_surface(self.preset.surfaces, points, which):
+        for part in parts or self.parts(points, which):
             result[part.here] = part.normals
         return result
 
-    def heat_at(self, points: Tensor, which: Tensor) -> SurfaceHeat:
+    def heat_at(self, points: Tensor, which: Tensor, parts: list[OnSurface] | None = None) -> SurfaceHeat:
         """Start, flux and material at ``points`` [n, 3] that lie on the surfaces numbered ``which`` [n] (-1: none)."""
         result = SurfaceHeat(
             torch.zeros(len(points), dtype=torch.float64),
@@ -168,7 +155,8 @@ class Scene:
             *((points.new_zeros(len(points), 3), points.new_zeros(len(points), 3)) if self.preset.diffusivity else ()),
         )
         normals, reaching = torch.zeros_like(points), torch.zeros_like(result.flux_w_m2)
-        for part in by_surface(self.preset.surfaces, points, which):
+        parts = parts or self.parts(points, which)
+        for part in parts:
             surface, here, on, local = part.surface, part.here, part.on, part.local
             result.material[here] = self.materials.index(surface.material)
             if surface.name in self.preset.start_k:
@@ -192,7 +180,7 @@ class Scene:
             return result
         there = which >= 0
         fluxes = points.new_zeros(len(points), len(self.preset.carried.stations))
-        on, normals = points[there], self.normals(points, which)[there]
+        on, normals = points[there], self.normals(points, which, parts)[there]
         fluxes[there] = self.preset.carried.fluxes(on, normals, self.shapes, self.preset.ambient_c)
         return replace(result, carried_w_m2=fluxes)
 
@@ -323,21 +311,23 @@ class Scene:
             self._asked = points.clone(), self.heat_at(*self.nearest(points))
         return self.celsius(self._asked[1], times_s.to("cpu", torch.float64).reshape(-1))
 
-    def color(self, points: Tensor, which: Tensor) -> Tensor:
+    def color(self, points: Tensor, which: Tensor, parts: list[OnSurface] | None = None) -> Tensor:
         """Colour [n, 3] in [0, 1] that surface points reflect: Lambertian, dark where the paint absorbs heat."""
         color, sun = torch.zeros_like(points), points.new_tensor(_SUN)
-        for part in by_surface(self.preset.surfaces, points, which):
+        for part in parts or self.parts(points, which):
             daylight = _SKYLIGHT + (1 - _SKYLIGHT) * (part.normals @ sun).clamp_min(0.0)
             albedo = 1 - (1 - _DARKEST) * part.absorbs
             color[part.here] = (albedo * daylight)[:, None] * points.new_tensor(part.surface.color)
         return color
 
-    def visible(self, points: Tensor, which: Tensor, directions: Tensor) -> Tensor:
+    def visible(
+        self, points: Tensor, which: Tensor, directions: Tensor, parts: list[OnSurface] | None = None
+    ) -> Tensor:
         """Colour [n, 3] in [0, 1] seen along rays that first meet ``points`` [n, 3] on surfaces ``which`` [n].
 
         A surface that transmits light adds its own colour to that of what lies behind it.
         """
-        color = self.color(points, which)
+        color = self.color(points, which, parts)
         share = self.transmits[which]
         clear = share.nonzero()[:, 0]
         if len(clear):

@@ -25,7 +25,7 @@ from heatsplat.datamodules.synthetic_scene.film import (
 )
 from heatsplat.datamodules.synthetic_scene.paths import frame_times
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS, TABLE_TOP, Pattern, Preset
-from heatsplat.datamodules.synthetic_scene.scene import Scene, by_surface
+from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 from heatsplat.physics.relaxation import harmonic_response
 
@@ -181,26 +181,20 @@ def test_heated_follows_its_lamp_over_several_periods():
     assert warm.amax() - warm.amin() > 30.0
 
 
-def test_points_are_divided_among_surfaces_once_until_somebody_moves_them():
-    scene, surfaces = scene_of("heated"), PRESETS["heated"].surfaces
+def test_points_are_divided_among_surfaces_and_asked_in_parts():
+    scene = scene_of("heated")
     points, which = (of_all.clone() for of_all in seen_points("heated"))
     which[:5] = -1
-    parts = by_surface(surfaces, points, which)
+    parts = scene.parts(points, which)
     for part in parts:
-        assert part.surface is surfaces[part.number]
-        assert torch.equal(part.here, (which == part.number).nonzero()[:, 0]) and torch.equal(
-            part.on, points[part.here]
-        )
+        assert part.surface is scene.preset.surfaces[part.number]
+        assert torch.equal(part.here, (which == part.number).nonzero()[:, 0])
+        assert torch.equal(part.on, points[part.here])
     assert sum(len(part.here) for part in parts) == (which >= 0).sum() and all(len(part.here) for part in parts)
-    color, heat = scene.color(points, which), scene.heat_at(points, which)
-    assert by_surface(surfaces, points, which) is parts
-    for of_all in (points, which):
-        of_all.copy_(of_all.flip(0))
-    torch.testing.assert_close(scene.color(points, which), color.flip(0))
-    torch.testing.assert_close(scene.heat_at(points, which).flux_w_m2, heat.flux_w_m2.flip(0))
-    with torch.inference_mode():  # in which a test of a run asks
-        moved = points.flip(0)
-        torch.testing.assert_close(scene.color(moved, which.flip(0)), color)
+    for asked in (scene.color, scene.normals, lambda *args: scene.heat_at(*args).flux_w_m2):
+        found = asked(points, which)
+        assert torch.equal(asked(points, which, parts), found) and (found[:5] == 0).all()
+        torch.testing.assert_close(asked(points.flip(0), which.flip(0)), found.flip(0))
 
 
 def test_the_lamp_casts_shadows():

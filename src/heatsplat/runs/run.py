@@ -91,7 +91,7 @@ def train_in(config: dict[str, Any], output_dir: Path) -> RunResults:
         log.info("%s has results already; skipped. Delete the folder to run it again.", output_dir)
         return results
     composed, config, data = _opened(config, output_dir)
-    # Before the search for effects, which takes minutes; written down once nothing refuses the run any more.
+    # Before the search for effects, which may take minutes; written down once nothing refuses the run any more.
     found = warn_of(data.scene) if config["doctor"] and config["ckpt"] is None else []
     run = _planned(composed, config, data, output_dir)
     if found:

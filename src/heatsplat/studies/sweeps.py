@@ -21,16 +21,8 @@ from heatsplat.studies.recorded import OVERRIDES
 log = logging.getLogger(__name__)
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
-# Scores and costs in the table, where any job has them.
-SCORES = (
-    "psnr",
-    "ssim",
-    "lpips",
-    "mae_c",
-    "clean_psnr",
-    "clean_mae_c",
-    "rgb_psnr",
-)  # and after them those of own callbacks
+# Scores and costs in the table, where any job has them; between them stand the scores of own callbacks.
+SCORES = ("psnr", "ssim", "lpips", "mae_c", "clean_psnr", "clean_mae_c", "rgb_psnr")
 COSTS = ("train_seconds", "peak_memory_mb", "gaussians", "render_fps")
 OWN_DIGITS = 4  # significant ones of the largest value of an own score
 
