@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError, ThermalRange
-from heatsplat.datamodules.side_files import finite, json_object
-from heatsplat.physics.units import KELVIN_AT_0_C, says_fahrenheit
+from heatsplat.datamodules.side_files import finite, json_object, says_fahrenheit
+from heatsplat.physics.units import KELVIN_AT_0_C
 
 BOUNDS_FILE = "temperature_bounds.json"
 # °C that a camera can read: from absolute zero to beyond any thermal camera.

@@ -15,6 +15,12 @@ from typing import Any
 
 from heatsplat.contracts import SceneError
 
+# How programs name the unit beside numbers: in words, or as F where a unit is told (text, JSON, GDAL's metadata).
+FAHRENHEIT = re.compile(
+    r"°\s*F\b|\bdeg(?:rees?)?[\s_]*F\b|\bfahrenheit\b|units?[\"']?\s*[=:]\s*[\"']?F\b(?![-/])|unittype\"[^<>]*>\s*F\b",
+    re.IGNORECASE,
+)
+
 
 def found_file(key: str, path: str | Path, folder: Path | None) -> Path:
     """The file that a setting of the data names: in the folder of the scene, else in the working directory.
@@ -82,6 +88,11 @@ def finite(value: Any, where: str, what: str = "a number") -> float:
     if not math.isfinite(number):
         raise SceneError(f"{where} is {number}, {what} is needed")
     return number
+
+
+def says_fahrenheit(text: str) -> bool:
+    """Whether text beside numbers says that they are °F."""
+    return FAHRENHEIT.search(text) is not None
 
 
 def shortened(value: Any, most: int = 60) -> str:

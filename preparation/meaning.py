@@ -13,9 +13,10 @@ from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.dji import PER_KELVIN
 from heatsplat.datamodules.formats.images import tiff_text
 from heatsplat.datamodules.formats.radiometric import Calibration
+from heatsplat.datamodules.side_files import says_fahrenheit
 from heatsplat.physics.planck import Band
 from heatsplat.physics.radiometry import BandResponse, PlanckResponse
-from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, USUAL_MEDIAN_C, is_centikelvin, says_fahrenheit
+from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, USUAL_MEDIAN_C, is_centikelvin
 
 # °C per count of other cameras that store kelvin; nothing in a file tells them apart, so they are named and asked for.
 OTHERS = {

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from heatsplat.contracts import SceneError
-from heatsplat.physics.units import says_fahrenheit
+from heatsplat.datamodules.side_files import says_fahrenheit
 
 SUFFIX = ".csv"
 MIN_SIDE = 16  # pixels: smaller tables are no images

@@ -4,13 +4,11 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.kernels import spherical_harmonics as kernel
 from heatsplat.physics import units
-from heatsplat.physics.units import says_fahrenheit
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -34,20 +32,3 @@ def test_counts_that_are_plausible_as_kelvin_x_100():
     assert units.is_centikelvin(28500.0, 29500.0, 31500.0)
     assert not units.is_centikelvin(12000.0, 13000.0, 14000.0)  # -143 °C
     assert not units.is_centikelvin(5000.0, 29500.0, 60000.0)  # 550 K between the coldest and the hottest
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["Unit: °F", "unit=F", '{"unit": "F", "emissivity": 0.95}', "camera: T1020; Units = Fahrenheit", "in degrees F", "degF",
-     '<Item name="UNITTYPE" sample="0" role="unittype">F</Item>', 'role="unittype">deg F<', "temperature_unit: f"],
-)  # fmt: skip
-def test_text_that_says_fahrenheit(text):
-    assert says_fahrenheit(text)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["", "Unit: °C", '{"unit": "C"}', "Unit: Fluke", "degC", 'role="unittype">K<', "community: F", "F", "units: F/1.4"],
-)
-def test_text_that_does_not(text):
-    assert not says_fahrenheit(text)

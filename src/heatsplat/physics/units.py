@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import TypeVar
 
 from torch import Tensor
@@ -14,11 +13,6 @@ CENTIKELVIN = 0.01  # kelvin per count of cameras that store kelvin x 100 (Lepto
 USUAL_MEDIAN_C, USUAL_SPAN_K = (-40.0, 100.0), 200.0
 STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m² K⁴), CODATA 2018
 
-# How programs name the unit beside numbers: in words, or as F where a unit is told (text, JSON, GDAL's metadata).
-FAHRENHEIT = re.compile(
-    r"°\s*F\b|\bdeg(?:rees?)?[\s_]*F\b|\bfahrenheit\b|units?[\"']?\s*[=:]\s*[\"']?F\b(?![-/])|unittype\"[^<>]*>\s*F\b",
-    re.IGNORECASE,
-)
 
 Temperature = TypeVar("Temperature", float, Tensor)
 
@@ -39,8 +33,3 @@ def is_centikelvin(low: float, median: float, high: float) -> bool:
         USUAL_MEDIAN_C[0] < CENTIKELVIN * median - KELVIN_AT_0_C < USUAL_MEDIAN_C[1]
         and CENTIKELVIN * (high - low) < USUAL_SPAN_K
     )
-
-
-def says_fahrenheit(text: str) -> bool:
-    """Whether text beside numbers says that they are °F."""
-    return FAHRENHEIT.search(text) is not None

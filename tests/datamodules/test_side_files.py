@@ -1,0 +1,22 @@
+"""What people and their programs write beside images."""
+
+import pytest
+
+from heatsplat.datamodules.side_files import says_fahrenheit
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["Unit: °F", "unit=F", '{"unit": "F", "emissivity": 0.95}', "camera: T1020; Units = Fahrenheit", "in degrees F", "degF",
+     '<Item name="UNITTYPE" sample="0" role="unittype">F</Item>', 'role="unittype">deg F<', "temperature_unit: f"],
+)  # fmt: skip
+def test_text_that_says_fahrenheit(text):
+    assert says_fahrenheit(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "Unit: °C", '{"unit": "C"}', "Unit: Fluke", "degC", 'role="unittype">K<', "community: F", "F", "units: F/1.4"],
+)
+def test_text_that_does_not(text):
+    assert not says_fahrenheit(text)
