@@ -5,7 +5,7 @@ import torch
 
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View, ViewSet, WeightedSums
 from heatsplat.density.adaptive import Adaptive
-from heatsplat.density.budget import CURVES, Budget, _drawn
+from heatsplat.density.budget import CURVES, Budget, _best
 from heatsplat.density.ops import Cloud
 from heatsplat.renderers.base import rasterization
 from heatsplat.splats import Splats
@@ -36,17 +36,20 @@ def refine(policy: Budget, cloud: Cloud, step: int, seed: int = 0):
 
 def blame(cloud: Cloud, score: list[float], wrong: float = 100.0) -> None:
     """What observing views would have summed."""
-    cloud.state["score"] = torch.tensor(score)
-    cloud.state["wrong"] = torch.where(cloud.state["score"] > 0, wrong, 0.0)
+    cloud.state["worth"] = torch.tensor(score)
+    cloud.state["pull"] = torch.ones(len(cloud))
+    cloud.state["wrong"] = torch.where(cloud.state["worth"] > 0, wrong, 0.0)
     cloud.state["weight"] = torch.full((len(cloud),), 200.0)
 
 
 def observed(policy: Budget, cloud: Cloud, sums: torch.Tensor, step: int) -> None:
-    """A view of all Gaussians, with these sums [n, S]."""
+    """A view of all Gaussians, with these sums [n, S], in which each pixel pulls at them alike."""
+    means2d = torch.zeros(len(cloud), 2)
+    means2d.absgrad = torch.ones(len(cloud), 2)
     rows = torch.zeros_like(sums, requires_grad=True)
     rows.grad = sums
     output = RenderOutput(
-        torch.zeros(10, 20, 1), torch.zeros(1, 10, 20), None, {"visible_ids": torch.arange(len(cloud))},
+        torch.zeros(10, 20, 1), torch.zeros(1, 10, 20), None, {"visible_ids": torch.arange(len(cloud)), "means2d": means2d},
         WeightedSums(torch.zeros(10, 20, sums.shape[1]), rows),
     )  # fmt: skip
     policy.observe(cloud.state, output, CAMERA, step)
@@ -141,11 +144,57 @@ def test_one_event_splits_each_gaussian_once_at_most():
 
 def test_only_gaussians_with_a_score_grow_the_worst_most_often():
     scores = torch.tensor([0.0, 1.0, 3.0, 6.0]).repeat(1000)
-    drawn = _drawn(scores, 300, torch.Generator().manual_seed(1))
+    drawn = _best(scores, 300, torch.Generator().manual_seed(1))
     counts = (drawn % 4).bincount(minlength=4)
     assert len(drawn.unique()) == 300 and counts[0] == 0
     assert counts[1:].tolist() == pytest.approx([30, 90, 180], abs=25)
-    assert len(_drawn(scores, 9999, torch.Generator())) == 3000
+    assert len(_best(scores, 9999, torch.Generator())) == 3000
+
+
+def test_those_of_the_highest_scores_are_split_unless_they_are_drawn():
+    scores = torch.tensor([2.0, 0.0, 9.0, 4.0, 3.0, 4.0])
+    assert _best(scores, 3, None).tolist() == [2, 3, 5]
+    assert _best(scores, 2, None).tolist() == [2, 3]  # of equals the first
+    assert _best(scores, 99, None).tolist() == [0, 2, 3, 4, 5]
+    chosen = set()
+    for sampled in (False, True):
+        for seed in range(20):
+            policy = budget(start=0, stop=10, every=10, cap_max=7, sampled=sampled, remove_at=())
+            cloud = make_cloud(policy, 6)
+            blame(cloud, scores.tolist())
+            assert refine(policy, cloud, 9, seed).added == 1
+            first = cloud.splats.means[:, 0]
+            chosen.add((sampled, int((first - torch.arange(7) * 3).abs().gt(0.01).nonzero()[0])))
+    assert [index for sampled, index in chosen if not sampled] == [2]
+    assert {index for sampled, index in chosen if sampled} == {0, 2, 3, 4, 5}
+
+
+def test_both_is_error_times_pull_and_the_error_alone_where_nothing_pulls():
+    policy = budget(start=0, stop=100, every=10, remove_at=())
+    cloud = make_cloud(policy, 4)
+    blame(cloud, [3.0, 2.0, 5.0, 0.0])
+    cloud.state["pull"] = torch.tensor([2.0, 4.0, 0.0, 9.0])
+    assert policy._scored(cloud.state).tolist() == [6, 8, 0, 0]
+    cloud.state["pull"].zero_()
+    assert policy._scored(cloud.state).tolist() == [3, 2, 5, 0]
+
+
+def test_only_what_the_score_asks_for_is_gathered():
+    gathered = {}
+    for score in ("both", "error", "edge", "absgrad", "uniform"):
+        policy = budget(start=0, stop=100, every=10, views=2, score=score, remove_at=())
+        names = set(policy.initial_state(1, torch.device("cpu"))) - {"shown", "seen"}
+        asked = [[policy.absgrad_at(step), policy.maps_at(step)] for step in (7, 9, 100)]
+        assert asked[0] == asked[2] == [False, 0]
+        gathered[score] = (names, *asked[1])
+    pixels = {"weight", "wrong", "worth"}
+    assert gathered == {
+        "both": (pixels | {"pull"}, True, 3),
+        "error": (pixels, False, 3),
+        "edge": (pixels, False, 3),
+        "absgrad": ({"pull"}, True, 0),
+        "uniform": (set(), False, 0),
+    }
 
 
 def test_score_is_error_beyond_the_noise_summed_over_the_last_views_before_an_event():
@@ -158,9 +207,9 @@ def test_score_is_error_beyond_the_noise_summed_over_the_last_views_before_an_ev
     cloud = make_cloud(policy, 2)
     for step in (7, 8):
         observed(policy, cloud, torch.tensor([[50.0, 40.0, 2.0], [0.0, 0.0, 0.0]]), step)
-    assert cloud.state["score"].tolist() == [4, 0] and cloud.state["wrong"].tolist() == [80, 0]
+    assert cloud.state["worth"].tolist() == [4, 0] and cloud.state["wrong"].tolist() == [80, 0]
     assert refine(policy, cloud, 9).added == 1
-    assert not cloud.state["score"].any() and cloud.splats.means[1].tolist() == [3, 4, 5]
+    assert not cloud.state["worth"].any() and cloud.splats.means[1].tolist() == [3, 4, 5]
 
 
 def test_gaussians_wrong_on_few_pixels_are_not_split():
@@ -197,7 +246,7 @@ def test_pixels_that_are_not_known_have_no_edges_and_make_none():
 
 def test_absgrad_scores_by_the_pull_on_screen_positions():
     policy = budget(start=0, stop=100, every=10, views=2, score="absgrad", remove_at=())
-    assert policy.absgrad and policy.maps_at(9) == 0
+    assert policy.absgrad_at(9) and policy.maps_at(9) == 0
     cloud = make_cloud(policy, 2)
     means2d = torch.zeros(2, 2)
     means2d.absgrad = torch.tensor([[3.0, 0.0], [0.0, 2.0]])
@@ -205,7 +254,10 @@ def test_absgrad_scores_by_the_pull_on_screen_positions():
     output = RenderOutput(torch.zeros(10, 20, 1), torch.zeros(1, 10, 20), None, meta)
     for step in (7, 8, 9):
         policy.observe(cloud.state, output, CAMERA, step)
-    assert cloud.state["score"].tolist() == [60, 20]
+    assert cloud.state["pull"].tolist() == [60, 20] and policy._scored(cloud.state).tolist() == [60, 20]
+    del means2d.absgrad  # centres that are held still leave none on some renderers
+    policy.observe(cloud.state, output, CAMERA, 8)
+    assert cloud.state["pull"].tolist() == [60, 20]
 
 
 def noisy_scene(noise: float, views: int) -> SceneData:
@@ -349,6 +401,7 @@ def share_of_new_on_the_right(policy, steps: int, noise: float) -> float:
         output = rasterization(
             splats.means, splats.quats, splats.scales, splats.opacities, splats["heat"], camera.viewmat.float(),
             camera.K.float(), camera.width, camera.height, backend="cpu", depth=False, maps=policy.maps_at(step),
+            absgrad=policy.absgrad_at(step),
         )  # fmt: skip
         error = (output.features - target).abs()
         loss = error.mean()

@@ -84,6 +84,17 @@ def test_what_one_view_of_ten_shows_wrong_does_not_grow():
     assert passed.any()
 
 
+def test_pixels_that_do_not_count_neither_are_the_largest_errors_nor_hide_them():
+    policy, step = control(), 19
+    error, target = torch.full((SIDE, SIDE), 0.05), torch.full((SIDE, SIDE, 1), 0.5)
+    error[0, :4] = 1.0  # of 4 x 16 pixels that count
+    target[4:], error[4:] = torch.nan, 0.0
+    target[:, 16:], error[:, 16:] = torch.nan, 0.0
+    assert policy.pixel_maps(error, target, step)[..., 0].nonzero().tolist() == [[0, 0], [0, 1], [0, 2], [0, 3]]
+    assert policy._mean_error == pytest.approx((4 * 1.0 + 60 * 0.05) / 64)
+    assert not policy.pixel_maps(torch.zeros(SIDE, SIDE), torch.full((SIDE, SIDE, 1), torch.nan), step).any()
+
+
 @pytest.mark.parametrize("floor, least, most", [(True, 0.0, 0.01), (False, 0.9, 1.0)])
 def test_noise_is_not_wrong_but_would_be_without_the_floor(floor, least, most):
     policy = control()

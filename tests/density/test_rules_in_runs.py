@@ -19,7 +19,7 @@ RULES = {
     "mcmc": ("density.start=5", "density.every=10", "density.stop=40", "density.dead_opacity=0.08"),
 }  # fmt: skip
 
-GATHERED = {"multiview_gate": ("gradient", "seen"), "budget": ("score", "wrong", "weight"), "mcmc": ()}
+GATHERED = {"multiview_gate": ("gradient", "seen"), "budget": ("pull", "worth", "wrong", "weight"), "mcmc": ()}
 
 
 BRIEF = {  # the same in ten steps

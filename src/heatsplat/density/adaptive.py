@@ -79,6 +79,9 @@ class Adaptive(DensityControl):
         """ "gradient" [N], the sum of gradient norms, and "seen" [N], the number of views that saw the Gaussian."""
         return {"gradient": torch.zeros(count, device=device), "seen": torch.zeros(count, device=device)}
 
+    def absgrad_at(self, step: int) -> bool:
+        return self.absgrad and step < self.stop
+
     @torch.no_grad()
     def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:
         if step >= self.stop:

@@ -30,7 +30,6 @@ class DensityControl:
     Its state is a dict of [N, ...] tensors kept outside, in the Cloud. The default does nothing at all, which is ``fixed``.
 
     Attributes:
-        absgrad: whether ``observe`` wants absolute per-pixel gradients.
         rows: what rows of the splats may be that it counts on (``heatsplat.splats``).
         cap_max: never more Gaussians than this, from the start on; it may be set during a run. None: no Gaussians are added.
         milestones, intervals: names of its attributes that are steps of the run, and numbers of steps (``retime``).
@@ -39,7 +38,6 @@ class DensityControl:
         opacities_until: step from which on a stage holds opacities still until the run ends, as the run tells it; infinity: none.
     """
 
-    absgrad: bool = False
     rows: frozenset[str] = frozenset({GAUSSIANS})
     cap_max: float | None = None
     milestones: tuple[str, ...] = ()
@@ -56,6 +54,10 @@ class DensityControl:
     def prepare(self, scene: SceneData, modality: str) -> None:
         """Takes what it needs of the scene, before anything is trained: how noisy its images are, how many there are."""
         return
+
+    def absgrad_at(self, step: int) -> bool:
+        """Whether ``observe`` wants the absolute gradients of single pixels in this step; False costs nothing."""
+        return False
 
     def maps_at(self, step: int) -> int:
         """How many maps over pixels it wants summed by blending weights in this step (``pixel_maps``); 0 costs nothing."""
@@ -129,7 +131,7 @@ def ndc_gradient_norms(output: RenderOutput, camera: Camera, absolute: bool = Fa
         absolute: of the absolute gradients of single pixels, summed (AbsGS).
     """
     means2d = output.meta["means2d"]
-    gradients = means2d.absgrad if absolute else means2d.grad
+    gradients = getattr(means2d, "absgrad", None) if absolute else means2d.grad
     if gradients is None:
         return None
     half_size = gradients.new_tensor([camera.width / 2, camera.height / 2])

@@ -22,9 +22,10 @@ CURVES: dict[str, Callable[[float], float]] = {
     "linear": lambda x: x,
     "concave": lambda x: 2 * x - x * x,
 }
-SCORES = ("error", "edge", "absgrad", "uniform")
+SCORES = ("both", "error", "edge", "absgrad", "uniform")
 BLUR = 1.5  # pixels: standard deviation of the Gaussian under which edges are looked for; noise has weaker ones
 BY_CHANCE = 0.01  # of a Gaussian's pixels, noise alone lifts fewer above three of its standard deviations (0.27 %)
+OF_PIXELS = ("weight", "wrong", "worth")  # what maps over pixels are summed into, in their order
 DIM = 0.01  # of all that a view shows, the Gaussians that contribute least and together no more than this are not seen in it
 
 
@@ -34,12 +35,13 @@ class Budget(DensityControl):
     B is ``cap_max`` or, where that is less, ``multiple`` times the Gaussians of the start. A start of few Gaussians says
     little of what a scene needs: B is at least ``least``, or one for two pixels of a training image where that is less.
 
-    The score of a Gaussian is the error that its pixels have beyond the noise of the camera, weighted by how much of each
-    pixel it is, Σ_v Σ_p w max(e - floor noise, 0), over the last ``views`` steps before an event (the sampler shows each
-    view once a pass). Those to be split are drawn by score, without replacement, and only among those that are wrong on
-    enough pixels for that not to be noise. Of the Gaussians that are still missing, an event adds the share that its part
-    of ``curve`` has of what is left of the curve; so their number follows N0 + (B - N0) curve(x), catches up with what was
-    removed or held back, and is B after the last event if enough of them are wrong.
+    The score of a Gaussian is the product of two sums over the last ``views`` steps before an event (the sampler shows each
+    view once a pass). One says how wrong its pixels are: their errors beyond the noise of the camera, weighted by how much of
+    each pixel it is, Σ_v Σ_p w max(e - floor noise, 0). The other says how much that changes with its place on the screen x:
+    how hard single pixels pull there, Σ_v |Σ_p |∂L/∂x||. Those with the highest scores are split, and only those that are
+    wrong on enough pixels for that not to be noise. Of the Gaussians that are still missing, an event adds the share that
+    its part of ``curve`` has of what is left of the curve; so their number follows N0 + (B - N0) curve(x), catches up with
+    what was removed or held back, and is B after the last event if enough of them are wrong.
 
     Once they have come, Gaussians leave that the training views hardly show: after the first whole pass of the views that
     begins at a step of ``remove_at`` or later, those outside the share ``keep`` of all blending weights, and those seen in
@@ -49,7 +51,8 @@ class Budget(DensityControl):
     shows is never removed.
 
     After Taming 3DGS (Mallick et al. 2024: budget, concave curve), Revising Densification (Bulo et al. 2024: error by
-    blending weights), Improved-GS (2025: long-axis split, root curve) and Mini-Splatting2 (2024: removal).
+    blending weights), AbsGS (Ye et al. 2024: pull), Improved-GS (2025: long-axis split, root curve) and Mini-Splatting2
+    (2024: removal).
 
     Args:
         start, stop: first and last step at which Gaussians are added, or removed as transparent.
@@ -57,8 +60,10 @@ class Budget(DensityControl):
         cap_max: never more Gaussians than this.
         multiple: B in Gaussians of the start; None: B is ``cap_max``.
         least: B of images of any size where the start has few Gaussians.
-        score: "error", "edge" (the Laplacian of the blurred training images, in place of the error: Improved-GS), "absgrad"
-            (the pull on screen positions, AbsGS) or "uniform" (any of them alike).
+        score: "both", "error", "edge" (the Laplacian of the blurred training images, in place of the error: Improved-GS),
+            "absgrad" (the pull: AbsGS) or "uniform" (any of them alike).
+        sampled: those to be split are drawn by score, without replacement, in place of the highest (Taming 3DGS); "uniform"
+            draws in any case.
         curve: "sqrt", "linear" or "concave", of the share x of the events that are done.
         views: steps before an event over which the score is summed.
         floor: errors up to so many standard deviations of the noise do not count; 0 counts all.
@@ -83,7 +88,8 @@ class Budget(DensityControl):
         cap_max: int = 100_000,
         multiple: float | None = 3.0,
         least: int = 10_000,
-        score: str = "error",
+        score: str = "both",
+        sampled: bool = False,
         curve: str = "linear",
         views: int = 10,
         floor: float = 3.0,
@@ -115,7 +121,8 @@ class Budget(DensityControl):
         self.start, self.stop, self.every, self.cap_max = start, stop, every, cap_max
         self.multiple, self.least = multiple, least
         self.score, self.curve, self.views = score, CURVES[curve], min(views, every)
-        self.absgrad = score == "absgrad"
+        self.sampled = sampled or score == "uniform"
+        self._of_pixels, self._of_pull = score in ("both", "error", "edge"), score in ("both", "absgrad")
         self.floor, self.noise, self.least_pixels = floor, noise, least_pixels
         self.prune_opacity, self.remove_at, self.keep = prune_opacity, tuple(remove_at), keep
         self.split = split or LongAxisSplit()
@@ -136,9 +143,14 @@ class Budget(DensityControl):
                 )
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
-        """What was summed since the last event, each [count]: "score", "wrong" (pixels) and "weight" (pixels) for growth,
-        "shown" (pixels) and "seen" (views) for removal."""
-        return {name: torch.zeros(count, device=device) for name in ("score", "wrong", "weight", "shown", "seen")}
+        """What was summed since the last event, each [count]: for growth, as far as the score asks, "pull", "weight" and "wrong"
+        (pixels) and "worth" (errors or edges); "shown" (pixels) and "seen" (views) for removal."""
+        return {name: torch.zeros(count, device=device) for name in (*self._summed, "shown", "seen")}
+
+    @property
+    def _summed(self) -> tuple[str, ...]:
+        """Names of what is summed for growth."""
+        return (("pull",) if self._of_pull else ()) + (OF_PIXELS if self._of_pixels else ())
 
     @property
     def budget(self) -> float:
@@ -175,9 +187,12 @@ class Budget(DensityControl):
 
     # What is gathered ------------------------------------------------------------------------------------------------
 
+    def absgrad_at(self, step: int) -> bool:
+        return self._of_pull and self._scores(step)
+
     def maps_at(self, step: int) -> int:
         """Three while scores are summed (weight, wrong pixels, error or edge), one while only weights are."""
-        return 3 if self._scores(step) and self.score in ("error", "edge") else int(self._judges(step))
+        return len(OF_PIXELS) if self._of_pixels and self._scores(step) else int(self._judges(step))
 
     def pixel_maps(self, error: Tensor, target: Tensor, step: int) -> Tensor:
         beyond = (error - self.floor * (self.noise or 0.0)).clamp(min=0)
@@ -188,13 +203,13 @@ class Budget(DensityControl):
     @torch.no_grad()
     def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:
         ids = output.meta["visible_ids"]
-        if self._scores(step) and self.absgrad:
-            state["score"].index_add_(0, ids, ndc_gradient_norms(output, camera, absolute=True).to(state["score"]))
+        if self.absgrad_at(step) and (pull := ndc_gradient_norms(output, camera, absolute=True)) is not None:
+            state["pull"].index_add_(0, ids, pull.to(state["pull"]))
         if output.weighted is None or output.weighted.sums is None:
             return
-        sums = output.weighted.sums.to(state["score"])
-        if self._scores(step) and self.score in ("error", "edge"):
-            for name, column in zip(("weight", "wrong", "score"), sums.unbind(1), strict=True):
+        sums = output.weighted.sums.to(state["shown"])
+        if self._scores(step) and self._of_pixels:
+            for name, column in zip(OF_PIXELS, sums.unbind(1), strict=True):
                 state[name].index_add_(0, ids, column)
         if self._judges(step):
             weight = sums[:, 0]
@@ -212,7 +227,7 @@ class Budget(DensityControl):
         if growth:
             removed += self._prune(cloud, self._visible(cloud), step)
             added = self._grow(cloud, step, generator)
-        for due, names in ((growth, ("score", "wrong", "weight")), (removal, ("shown", "seen"))):
+        for due, names in ((growth, self._summed), (removal, ("shown", "seen"))):
             for name in names if due else ():
                 cloud.state[name].zero_()
         return DensityChange(added, removed) if growth or removal else None
@@ -236,14 +251,23 @@ class Budget(DensityControl):
         )
 
     def _grow(self, cloud: Cloud, step: int, generator: torch.Generator) -> int:
-        state = cloud.state
-        score = torch.ones_like(state["score"]) if self.score == "uniform" else state["score"].clone()
-        if self.score == "error":
-            score[state["wrong"] <= self.least_pixels + BY_CHANCE * state["weight"]] = 0
         wanted = round(self._share(step) * max(self.budget - len(cloud), 0))
-        chosen = _drawn(score, wanted, generator)
+        chosen = _best(self._scored(cloud.state), wanted, generator if self.sampled else None)
         cloud.split(chosen, self.split)
         return len(chosen)
+
+    def _scored(self, state: dict[str, Tensor]) -> Tensor:
+        """Scores of the Gaussians [N], float64, 0 for those that are not to be split."""
+        score = torch.ones_like(state["shown"], dtype=torch.float64)
+        if self.score == "absgrad" or (
+            self._of_pull and state["pull"].any()
+        ):  # centres that are held still have no pull
+            score *= state["pull"]
+        if self._of_pixels:
+            score *= state["worth"]
+        if self.score in ("both", "error"):
+            score[state["wrong"] <= self.least_pixels + BY_CHANCE * state["weight"]] = 0
+        return score
 
     def _share(self, step: int) -> float:
         """Of the Gaussians that are missing, the share that comes at the event of this step."""
@@ -274,10 +298,13 @@ def _outside(weights: Tensor, share: float) -> Tensor:
     return torch.zeros_like(small).scatter_(0, order, small) | (weights <= 0)
 
 
-def _drawn(scores: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """At most ``count`` different ids, each draw by score among those left; none without a score. Ascending."""
-    # The largest keys of log score + Gumbel noise are such a draw (Gumbel-top-k; Efraimidis and Spirakis 2006).
-    uniform = torch.rand(scores.shape, generator=generator, dtype=torch.float64).clamp(min=1e-300)
-    keys = scores.double().log() - (-uniform.log()).log().to(scores.device)
+def _best(scores: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
+    """At most ``count`` different ids, ascending: those of the highest scores, or with a generator each draw by score among
+    those left; none without a score."""
+    keys = scores.log()
+    if generator is not None:
+        # The largest keys of log score + Gumbel noise are such a draw (Gumbel-top-k; Efraimidis and Spirakis 2006).
+        uniform = torch.rand(scores.shape, generator=generator, dtype=torch.float64).clamp(min=1e-300)
+        keys = keys - (-uniform.log()).log().to(scores.device)
     count = min(count, int((scores > 0).sum()))
     return keys.argsort(descending=True, stable=True)[:count].sort().values

@@ -143,13 +143,12 @@ class MultiviewGate(Adaptive):
 
     @torch.no_grad()
     def pixel_maps(self, error: Tensor, target: Tensor, step: int) -> Tensor:
-        self._mean_error = float(error.mean())  # for ``observe``, which follows in the same step
-        return self.wrong(error)[..., None].to(error)
-
-    def wrong(self, error: Tensor) -> Tensor:
-        """Which pixels of an image of absolute errors [H, W] are wrong, [H, W] bool."""
-        largest = torch.quantile(error.flatten(), LARGEST)
-        return error > (WRONG * largest).clamp(min=NOISES * self.noise)
+        counted = error[~target.isnan().any(dim=-1)]
+        self._mean_error = (
+            float(counted.mean()) if len(counted) else 0.0
+        )  # for ``observe``, which follows in the same step
+        largest = torch.quantile(counted, LARGEST) if len(counted) else error.new_zeros(())
+        return (error > (WRONG * largest).clamp(min=NOISES * self.noise))[..., None].to(error)
 
     @torch.no_grad()
     def observe(self, state: dict[str, Tensor], output: RenderOutput, camera: Camera, step: int) -> None:

@@ -290,7 +290,14 @@ class SplatTraining(SceneModel):
         self.cameras.keep_apart()
         taken_from = self.cameras.of(frame, progress)
         output = self.render(
-            frame, self.sensor.needs_depth, self.density.absgrad, maps, ratio, signs, generator=drawn, camera=taken_from
+            frame,
+            self.sensor.needs_depth,
+            self.density.absgrad_at(here),
+            maps,
+            ratio,
+            signs,
+            generator=drawn,
+            camera=taken_from,
         )
         image, *companions = self._images(output)
         prediction = self.sensor(image, frame, output.seen_depth)
