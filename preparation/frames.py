@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -36,8 +35,6 @@ from heatsplat.preparation.frame import ThermalFrame, frame_name
 from heatsplat.preparation.makers import RECORDS, exif_details, radiometric_frames
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.table import with_table
-
-log = logging.getLogger(__name__)
 
 # What makers and people put into names to tell the modalities of one exposure apart.
 MODALITY = re.compile(r"[_\-. ](T|V|W|Z|S|IR|R|RGB|VIS|thermal|visible|visual|photo)$", re.IGNORECASE)
