@@ -13,6 +13,7 @@ import io
 import logging
 import multiprocessing
 import os
+import shlex
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -167,12 +168,12 @@ MUTATIONS = (
     ),
     Mutation(
         "A zero quaternion is rendered", "renderers.reference",
-        " & inputs.quats.any(dim=1)", "", "tests/renderers/test_contract.py -k zero_quaternion-and-reference",
+        " & inputs.quats.any(dim=1)", "", "tests/renderers/test_contract.py -k 'zero_quaternion and reference'",
     ),
     Mutation(
         "E[x²] - E[x]² of a bright image", "losses.photometric",
         "shift = _mean(target.detach(), mask).mean()", "shift = 0.0 * _mean(target.detach(), mask).mean()",
-        "tests/losses/test_photometric.py -k contrast-or-constant",
+        "tests/losses/test_photometric.py -k 'contrast or constant'",
     ),
     Mutation(
         "√(x² + y²) of a flat image", "losses.sobel",
@@ -271,9 +272,7 @@ def first_failure(mutation: Mutation) -> str | None:
     for name in [name for name in sys.modules if name.split(".")[0] == "heatsplat"]:
         if name != __name__:
             del sys.modules[name]
-    words = mutation.tests.split(" ")
-    if "-k" in words:
-        words[-1] = words[-1].replace("-", " ")
+    words = shlex.split(mutation.tests)
     recorder = _Recorder()
     with contextlib.ExitStack() as stack:
         for stream in (contextlib.redirect_stdout, contextlib.redirect_stderr):

@@ -51,6 +51,7 @@ class Scenes(SceneDataModule):
         each: makes the data module of a scene from its name, ``each(scene=name)``.
         scenes: names of the scenes, two or more.
         far: metres that a camera sees; scenes lie this far from one another. The renderer must cut there, too.
+        downscale: factor by which images shrink, 1 or larger, given to ``each``.
         root: folder of the scenes, given to ``each``; None leaves ``each`` its own.
         scene: not used.
         seed: of the order of views.

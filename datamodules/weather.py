@@ -88,23 +88,7 @@ def make_weather(
         raise SceneError(f"{source} holds no weather: two or more samples of at least one column are needed")
     times_s, columns = _common_span(times_s, columns, notes)
     columns = {name: _filled(name, times_s, values, max_gap_s, source, notes) for name, values in columns.items()}
-    if "irradiance_w_m2" in columns:
-        below = columns["irradiance_w_m2"] < 0
-        if below.any():
-            notes["irradiance_offset"] = f"{int(below.sum())} values between {PYRANOMETER_OFFSET:g} and 0 W/m² set to 0"
-            columns["irradiance_w_m2"] = columns["irradiance_w_m2"].clip(0.0)
-    if COVER in columns:
-        columns["clouds"] = light_taken(columns.pop(COVER))
-        notes["clouds"] = "of the cover in the record (Kasten and Czeplak)"
-    if FALLEN in columns:
-        if RAIN in columns:
-            raise SceneError(f"{source} tells rain twice, as {RAIN} and as {FALLEN}; keep one")
-        # Between samples the rate is linear: about each it lasts for half of the time to either neighbour, so that what falls in
-        # all is what was measured, however uneven the samples are.
-        hours = np.diff(times_s) / 3600.0
-        before, after = np.concatenate([hours[:1], hours]), np.concatenate([hours, hours[-1:]])
-        columns[RAIN] = columns.pop(FALLEN) / (0.5 * (before + after))
-        notes["rain"] = "of what fell since the sample before"
+    _complete(times_s, columns, source, notes)
     missing = [name for name in WEATHER_COLUMNS if name not in columns]
     if missing:
         notes["missing"] = ", ".join(missing)
@@ -242,6 +226,27 @@ def _filled(
     if not there.all():
         notes["gaps"] = {**notes.get("gaps", {}), name: f"{int((~there).sum())} values interpolated"}
     return np.interp(times_s, times_s[there], values[there])
+
+
+def _complete(times_s: np.ndarray, columns: dict[str, np.ndarray], source: str, notes: dict[str, Any]) -> None:
+    """Light by night is zero, and of cover and of what fell become what models know: light that clouds take, and rain."""
+    if "irradiance_w_m2" in columns:
+        below = columns["irradiance_w_m2"] < 0
+        if below.any():
+            notes["irradiance_offset"] = f"{int(below.sum())} values between {PYRANOMETER_OFFSET:g} and 0 W/m² set to 0"
+            columns["irradiance_w_m2"] = columns["irradiance_w_m2"].clip(0.0)
+    if COVER in columns:
+        columns["clouds"] = light_taken(columns.pop(COVER))
+        notes["clouds"] = "of the cover in the record (Kasten and Czeplak)"
+    if FALLEN in columns:
+        if RAIN in columns:
+            raise SceneError(f"{source} tells rain twice, as {RAIN} and as {FALLEN}; keep one")
+        # Between samples the rate is linear: about each it lasts for half of the time to either neighbour, so that what falls in
+        # all is what was measured, however uneven the samples are.
+        hours = np.diff(times_s) / 3600.0
+        before, after = np.concatenate([hours[:1], hours]), np.concatenate([hours, hours[-1:]])
+        columns[RAIN] = columns.pop(FALLEN) / (0.5 * (before + after))
+        notes["rain"] = "of what fell since the sample before"
 
 
 def _with_sun(

@@ -125,35 +125,9 @@ def read_columns(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np
     if len(table.rows) < 2:
         raise SceneError(f"{path} holds no weather: a line of column names and two or more samples are needed")
     header = table.columns
-    plain = [_plain(name) for name in header]
-    time_at = next((plain.index(name) for name in TIME_NAMES if name in plain), None)
-    if time_at is None:
-        raise SceneError(
-            f"{path} has no column of times ({', '.join(TIME_NAMES[:4])}, time_s, ...); it has {', '.join(header)}"
-        )
-    wanted: dict[str, tuple[int, tuple[float, float]]] = {}
-    unused = []
-    for position in range(len(header)):
-        if position == time_at:
-            continue
-        try:
-            found = _quantity(header[position])
-        except ValueError as error:
-            raise SceneError(f"{path}: column {header[position]!r} {error}") from error
-        if found is None:
-            unused.append(header[position])
-        elif found[0] in wanted:
-            raise SceneError(
-                f"{path}: {header[wanted[found[0]][0]]!r} and {header[position]!r} are both {found[0]}; keep one"
-            )
-        else:
-            wanted[found[0]] = (position, found[1])
-    if not wanted:
-        raise SceneError(f"{path} has none of the columns {', '.join(QUANTITIES)}; it has {', '.join(header)}")
-    for name in unused:
-        if (quantity := _like(name)) is not None and quantity not in wanted:
-            log.warning("%s: column %r is not used; if it is %s in another unit, call it that", path, name, quantity)
-    own_zone = "UTC" if plain[time_at].endswith("utc") else zone
+    time_at = _time_column(header, path)
+    wanted, unused = _columns_of(header, time_at, path)
+    own_zone = "UTC" if _plain(header[time_at]).endswith("utc") else zone
     times, values = [], {name: [] for name in wanted}
     for number, cells in table.rows:
         where = f"{path}, line {number}, column {header[time_at]}"
@@ -177,6 +151,44 @@ def read_columns(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np
         )
     notes: dict[str, Any] = {"unused_columns": ", ".join(unused)} if unused else {}
     return seconds, {name: np.array(v) for name, v in values.items()}, notes
+
+
+def _time_column(header: Sequence[str], path: Path) -> int:
+    plain = [_plain(name) for name in header]
+    place = next((plain.index(name) for name in TIME_NAMES if name in plain), None)
+    if place is None:
+        raise SceneError(
+            f"{path} has no column of times ({', '.join(TIME_NAMES[:4])}, time_s, ...); it has {', '.join(header)}"
+        )
+    return place
+
+
+def _columns_of(
+    header: Sequence[str], time_at: int, path: Path
+) -> tuple[dict[str, tuple[int, tuple[float, float]]], list[str]]:
+    """Place and unit of each quantity in a table, and names of columns that are none; warns of those that may be meant to be."""
+    wanted: dict[str, tuple[int, tuple[float, float]]] = {}
+    unused = []
+    for position, name in enumerate(header):
+        if position == time_at:
+            continue
+        try:
+            found = _quantity(name)
+        except ValueError as error:
+            raise SceneError(f"{path}: column {name!r} {error}") from error
+        if found is None:
+            unused.append(name)
+            continue
+        quantity, unit = found
+        if quantity in wanted:
+            raise SceneError(f"{path}: {header[wanted[quantity][0]]!r} and {name!r} are both {quantity}; keep one")
+        wanted[quantity] = position, unit
+    if not wanted:
+        raise SceneError(f"{path} has none of the columns {', '.join(QUANTITIES)}; it has {', '.join(header)}")
+    for name in unused:
+        if (quantity := _like(name)) is not None and quantity not in wanted:
+            log.warning("%s: column %r is not used; if it is %s in another unit, call it that", path, name, quantity)
+    return wanted, unused
 
 
 def write_weather(path: Path, weather: Weather, names: Sequence[str] = (*WEATHER_COLUMNS, RAIN)) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,7 +25,7 @@ from heatsplat.datamodules.formats.images import (
     resized,
     to_grey,
 )
-from heatsplat.datamodules.formats.radiometric import read_bytes
+from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
 from heatsplat.datamodules.formats.temperature_table import SUFFIX as TABLE
 from heatsplat.datamodules.formats.temperature_table import read_temperature_table
 from heatsplat.datamodules.timestamps import dji_time, instant, zone_of
@@ -36,8 +35,6 @@ from heatsplat.preparation.frame import ThermalFrame, frame_name
 from heatsplat.preparation.makers import RECORDS, exif_details, radiometric_frames
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.table import with_table
-
-log = logging.getLogger(__name__)
 
 # What makers and people put into names to tell the modalities of one exposure apart.
 MODALITY = re.compile(r"[_\-. ](T|V|W|Z|S|IR|R|RGB|VIS|thermal|visible|visual|photo)$", re.IGNORECASE)
@@ -222,16 +219,24 @@ def _frames_of(
             name = frame_name(path, folder, number if several else None)
             load = partial(_grey if kind == "grey" else read_image, path, page if several else None)
             found.append(ThermalFrame(name, path, number, load, camera=camera, size=size, **details))
-    devices, calibrations = devices_of(found), {}
+    calibrations = _calibrations(kind, found, folder, reading.meaning, notes)
+    yield from (replace(frame, calibration=calibrations[frame.path]) for frame in found)
+
+
+def _calibrations(
+    kind: str, frames: Sequence[ThermalFrame], folder: Path, meaning: Meaning, notes: list[str]
+) -> dict[Path, Calibration | None]:
+    """What the numbers in each file mean, by the first frame of its camera."""
+    devices, calibrations = devices_of(frames), {}
     for device in devices:
         sample = device.frames[0]
         try:
             if kind == "grey":
-                calibration, note = reading.meaning.of_greys(folder)
+                calibration, note = meaning.of_greys(folder)
             elif kind == "counts":
-                calibration, note = reading.meaning.of_counts(sample.load(), sample.path)
+                calibration, note = meaning.of_counts(sample.load(), sample.path)
             else:
-                calibration, note = reading.meaning.of_floats(sample.load(), sample.path)
+                calibration, note = meaning.of_floats(sample.load(), sample.path)
         except SceneError as error:
             if len(devices) == 1:
                 raise
@@ -242,7 +247,7 @@ def _frames_of(
         if note not in notes:
             notes.append(note)
         calibrations |= dict.fromkeys((frame.path for frame in device.frames), calibration)
-    yield from (replace(frame, calibration=calibrations[frame.path]) for frame in found)
+    return calibrations
 
 
 def _grey(path: Path, page: int | None) -> np.ndarray:

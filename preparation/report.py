@@ -246,18 +246,8 @@ def pictures(target: Path, frames: Sequence[ThermalFrame], records: Sequence[Map
         return Section("Pictures", ["No frame has a temperature."])
     quantiles = np.array([q for _, q in known])
     unit = "°C" if frames[0].calibration is not None else "grey"
-    timed = "time_s" in known[0][0]
-    place, along = np.arange(len(known), dtype=float), "frame"
-    if timed:
-        place = np.array([row["time_s"] for row, _ in known])
-        length, unit_of_time = next((one for one in TIMES if np.ptp(place) >= 2 * one[0]), TIMES[-1])
-        place, along = place / length, f"{unit_of_time} since the first frame"
-    edges = np.linspace(quantiles[:, 0].min(), max(quantiles[:, -1].max(), quantiles[:, 0].min() + 1e-6), BINS + 1)
-    # A frame's share of pixels in each bin, from its distribution function, which its quantiles give.
-    share = np.stack([np.diff(np.interp(edges, *_rising(q), left=0.0, right=1.0)) for q in quantiles])
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    axes = figure.subplots()
     save_picture(_few_frames(shown, quantiles, unit), target / "report" / "frames.png")
+    save_picture(_histograms(quantiles, unit), target / "report" / "histograms.png")
     lines = [
         f"![{counted(min(len(shown), SHOWN), 'frame')}, one scale for all](report/frames.png)",
         "",
@@ -265,37 +255,9 @@ def pictures(target: Path, frames: Sequence[ThermalFrame], records: Sequence[Map
         "",
     ]
     if len(known) == 1:
-        axes.stairs(100 * share[0], edges, fill=True, color="tab:red")
-        axes.set(xlabel=unit, ylabel=f"% of pixels per {edges[1] - edges[0]:.2g} {unit}", title="Histogram")
-        axes.margins(x=0)
-        save_picture(figure, target / "report" / "histograms.png")
         return Section("Pictures", lines)
-    image = axes.imshow(
-        100 * share.T,
-        origin="lower",
-        aspect="auto",
-        extent=(-0.5, len(known) - 0.5, edges[0], edges[-1]),
-        cmap="magma",
-        vmax=100 * np.quantile(share, 0.995) or None,
-        interpolation="nearest",
-    )
-    figure.colorbar(image, label=f"% of pixels per {edges[1] - edges[0]:.2g} {unit}")
-    axes.set(xlabel="frame", ylabel=unit, title="Histogram of every frame")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    save_picture(figure, target / "report" / "histograms.png")
-
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    axes = figure.subplots()
-    for low, high, alpha in ((0, -1, 0.12), (LOW, HIGH, 0.25)):
-        axes.fill_between(place, quantiles[:, low], quantiles[:, high], alpha=alpha, color="tab:red", linewidth=0)
-    axes.plot(place, quantiles[:, MIDDLE], color="tab:red", marker=".", linewidth=1)
-    axes.set(
-        xlabel=along,
-        ylabel=unit,
-        title="Median of every frame, 5 .. 95 % of its pixels, and all of them",
-    )
-    axes.margins(x=0.01)
-    save_picture(figure, target / "report" / "over_time.png")
+    times = np.array([row["time_s"] for row, _ in known]) if "time_s" in known[0][0] else None
+    save_picture(_over_time(times, quantiles, unit), target / "report" / "over_time.png")
     middle = quantiles[:, MIDDLE]
     jump = np.abs(np.diff(middle)).max()
     lines += [
@@ -325,6 +287,50 @@ def _few_frames(frames: Sequence[ThermalFrame], quantiles: np.ndarray, unit: str
         place.set_axis_off()
     # The hottest and the coldest lie beyond.
     figure.colorbar(image, ax=list(places), label=unit, shrink=0.8, extend="both")
+    return figure
+
+
+def _histograms(quantiles: np.ndarray, unit: str) -> Figure:
+    """The shares of pixels in each bin of value, frame after frame; of one frame alone as steps."""
+    edges = np.linspace(quantiles[:, 0].min(), max(quantiles[:, -1].max(), quantiles[:, 0].min() + 1e-6), BINS + 1)
+    # A frame's share of pixels in each bin, from its distribution function, which its quantiles give.
+    share = np.stack([np.diff(np.interp(edges, *_rising(q), left=0.0, right=1.0)) for q in quantiles])
+    per_bin = f"% of pixels per {edges[1] - edges[0]:.2g} {unit}"
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    axes = figure.subplots()
+    if len(share) == 1:
+        axes.stairs(100 * share[0], edges, fill=True, color="tab:red")
+        axes.set(xlabel=unit, ylabel=per_bin, title="Histogram")
+        axes.margins(x=0)
+        return figure
+    image = axes.imshow(
+        100 * share.T,
+        origin="lower",
+        aspect="auto",
+        extent=(-0.5, len(share) - 0.5, edges[0], edges[-1]),
+        cmap="magma",
+        vmax=100 * np.quantile(share, 0.995) or None,
+        interpolation="nearest",
+    )
+    figure.colorbar(image, label=per_bin)
+    axes.set(xlabel="frame", ylabel=unit, title="Histogram of every frame")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    return figure
+
+
+def _over_time(times_s: np.ndarray | None, quantiles: np.ndarray, unit: str) -> Figure:
+    """How quantiles run over time, or from frame to frame where times are not known."""
+    place, along = np.arange(len(quantiles), dtype=float), "frame"
+    if times_s is not None:
+        length, unit_of_time = next((one for one in TIMES if np.ptp(times_s) >= 2 * one[0]), TIMES[-1])
+        place, along = times_s / length, f"{unit_of_time} since the first frame"
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    axes = figure.subplots()
+    for low, high, alpha in ((0, -1, 0.12), (LOW, HIGH, 0.25)):
+        axes.fill_between(place, quantiles[:, low], quantiles[:, high], alpha=alpha, color="tab:red", linewidth=0)
+    axes.plot(place, quantiles[:, MIDDLE], color="tab:red", marker=".", linewidth=1)
+    axes.set(xlabel=along, ylabel=unit, title="Median of every frame, 5 .. 95 % of its pixels, and all of them")
+    axes.margins(x=0.01)
     return figure
 
 

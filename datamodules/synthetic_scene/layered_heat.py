@@ -150,7 +150,7 @@ def volumes(body: Body, nodes: int = NODES_A_LAYER) -> tuple[np.ndarray, np.ndar
 
 @dataclass(frozen=True)
 class _Modes:
-    """Eigenvectors of the bodies' conduction, padded with modes that never stir; [B, J] each but ``start``.
+    """Eigenvectors of the bodies' conduction, padded with modes that never stir; [B, J] each.
 
     Args:
         rates: in 1/s.
@@ -179,6 +179,33 @@ class _Modes:
         return cls(
             *(np.stack([np.pad(row, (0, most - len(row))) for row in rows]) for rows in zip(*found, strict=True))
         )
+
+
+@dataclass(frozen=True)
+class _Exchange:
+    """What surfaces exchange at a moment, as far as it depends on their temperature; [P] each, or one number.
+
+    Args:
+        given: what does not depend on it, in W/m².
+        h: of convection, in W/(m² K).
+        emitting: ε σ.
+        wet: share of the evaporation of water, in [0, 1].
+        vapour: density in the air, in kg/m³.
+    """
+
+    given: np.ndarray
+    h: np.ndarray
+    emitting: np.ndarray
+    wet: np.ndarray
+    vapour: float
+
+    def at(self, kelvin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """q, its slope, and E."""
+        density, steep = saturated_kg_m3(kelvin)
+        moist = self.h / AIR_J_M3_K * np.where(density > self.vapour, self.wet, 1.0)  # dew falls on dry surfaces too
+        evaporated = moist * (density - self.vapour)
+        q = self.given - self.h * kelvin - self.emitting * kelvin**4 - EVAPORATION_J_KG * evaporated
+        return q, -self.h - 4.0 * self.emitting * kelvin**3 - EVAPORATION_J_KG * moist * steep, evaporated
 
 
 def solve(
@@ -217,6 +244,7 @@ def solve(
         state, film = start.modes.copy(), start.film_kg_m2.copy()
     else:
         state, film = start * even, np.zeros(len(emissivity))
+    drivers = sky.air_k, sky.wind_m_s, sky.vapour_kg_m3, sky.rain_kg_m2_s, sky.long_waves_w_m2, patches.sunlight_w_m2
     times = np.arange(sky.times_s[0], sky.times_s[-1] + 0.5 * step_s, step_s)
     course = np.empty((len(times), len(emissivity)), dtype=np.float32)
     now = (state * surface).sum(1)
@@ -226,36 +254,23 @@ def solve(
         place = (time - sky.times_s[0]) / (sky.times_s[1] - sky.times_s[0])
         k = min(int(place), len(sky.times_s) - 2)
         share = place - k
-
-        def driver(series: np.ndarray, k: int = k, share: float = share) -> np.ndarray:
-            return series[k] + share * (series[k + 1] - series[k])
-
-        air, vapour = driver(sky.air_k), driver(sky.vapour_kg_m3)
-        h = still + per_wind * driver(sky.wind_m_s)
+        air, wind, vapour, rain, of_sky, light = (series[k] + share * (series[k + 1] - series[k]) for series in drivers)
+        h = still + per_wind * wind
         below = air if patches.ground is None else now[patches.ground].mean()
-        waves = patches.sky_share * driver(sky.long_waves_w_m2) + (1 - patches.sky_share) * STEFAN_BOLTZMANN * below**4
-        given = patches.absorptivity * driver(patches.sunlight_w_m2) + emissivity * waves + h * air
+        waves = patches.sky_share * of_sky + (1 - patches.sky_share) * STEFAN_BOLTZMANN * below**4
+        given = patches.absorptivity * light + emissivity * waves + h * air
         wet = np.minimum(film / WET_KG_M2, 1.0)
-        wet = wet + (1.0 - wet) * transpires
-
-        def balance(kelvin: np.ndarray, given=given, h=h, wet=wet, vapour=vapour) -> tuple[np.ndarray, ...]:
-            """q, its slope, and E."""
-            density, steep = saturated_kg_m3(kelvin)
-            moist = h / AIR_J_M3_K * np.where(density > vapour, wet, 1.0)  # dew falls on dry surfaces too
-            evaporated = moist * (density - vapour)
-            q = given - h * kelvin - emitting * kelvin**4 - EVAPORATION_J_KG * evaporated
-            return q, -h - 4.0 * emitting * kelvin**3 - EVAPORATION_J_KG * moist * steep, evaporated
-
+        exchange = _Exchange(given, h, emitting, wet + (1.0 - wet) * transpires, vapour)
         if taken is not None:
             known = decay * state + of_start * taken[:, None] + driven
             without = (known * surface).sum(1)
             for _ in range(NEWTON_STEPS):
-                q, slope, _ = balance(now)
+                q, slope, _ = exchange.at(now)
                 now = now - (now - without - at_once * q) / (1.0 - at_once * slope)
-            q, _, evaporated = balance(now)
+            q, _, evaporated = exchange.at(now)
             state = known + of_end * q[:, None]
             course[number] = now = (state * surface).sum(1)
             dry = np.where(evaporated > 0, evaporated * (1.0 - transpires), evaporated)
-            film = np.clip(film + step_s * (driver(sky.rain_kg_m2_s) - dry), 0.0, holds)
-        taken = balance(now)[0]
+            film = np.clip(film + step_s * (rain - dry), 0.0, holds)
+        taken = exchange.at(now)[0]
     return Course(times, course, state, film)

@@ -135,6 +135,7 @@ def solve(slabs: Sequence[Slab], forcing: Forcing, start_k: np.ndarray | float, 
 
     Args:
         start_k: temperatures at the start, one for all or [m, nodes] evenly spaced in the graded index of depth.
+        tolerance_k: the largest change in K that is allowed (``error_k``).
 
     Raises:
         RuntimeError: no convergence at the finest level.

@@ -1,5 +1,6 @@
 """Every naive form that is put back is noticed by a test; study=mutations says by which."""
 
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -16,9 +17,15 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_what_is_mutated_still_stands_in_the_source(mutation):
     assert mutation.source() != mutation.path.read_text()
     compile(mutation.source(), mutation.module, "exec")
-    for word in mutation.tests.split(" -k")[0].split(" "):
+    words = shlex.split(mutation.tests)
+    paths = words[: words.index("-k")] if "-k" in words else words
+    for word in paths:
         path, _, name = word.partition("::")
         assert name in (ROOT / path).read_text(), word
+    keywords = [word for word in words[len(paths) + 1 :] for word in word.split()]
+    assert len(words) - len(paths) in (0, 2), "pytest takes one expression after -k: quote it"
+    there = "".join((ROOT / word.partition("::")[0]).read_text().lower() for word in paths)
+    assert [word for word in keywords if word.lower() not in there and word not in ("and", "or", "not")] == []
 
 
 def test_a_place_that_is_gone_is_named():
@@ -37,7 +44,7 @@ from benchmarks import mutations
 harmless = mutations.Mutation("harmless", "physics.units", "return celsius + KELVIN_AT_0_C",
                               "return KELVIN_AT_0_C + celsius", "tests/physics/test_units.py")
 fatal = mutations.Mutation("fatal", "physics.units", "return celsius + KELVIN_AT_0_C", "return celsius",
-                           "tests/physics/test_units.py")
+                           "tests/physics/test_units.py -k 'celsius and back'")
 mutations.MUTATIONS = (harmless, fatal)
 print(mutations.run("OUTPUT"))
 """

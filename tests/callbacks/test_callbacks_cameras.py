@@ -46,3 +46,15 @@ def test_images_without_times_get_none(tmp_path):
 
 def test_given_cameras_leave_no_file(tmp_path):
     assert not left_by(tmp_path, wall(), SimpleNamespace(learns=False)).exists()
+
+
+def test_a_file_that_cannot_be_written_whole_leaves_the_one_that_was_there(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError("No space left on device")
+
+    cameras = SimpleNamespace(learns=True, of=lambda frame: frame.camera)
+    before = left_by(tmp_path, wall(), cameras).read_text()
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        left_by(tmp_path, wall(), SimpleNamespace(learns=True, of=lambda frame: wall().train.frames[0].camera))
+    assert (tmp_path / CAMERAS_FILE).read_text() == before

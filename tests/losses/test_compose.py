@@ -115,11 +115,6 @@ def test_linear_ramp(progress, expected):
     assert schedules.linear(progress, 0.1, 0.5, before=2.0, after=4.0) == pytest.approx(expected)
 
 
-def test_constant_schedule():
-    assert schedules.constant(0.7) == 1.0
-    assert schedules.constant(0.7, 0.25) == 0.25
-
-
 def test_a_ramp_that_ends_before_it_starts_is_refused():
     with pytest.raises(ValueError, match="ends at 0.1 of the run, before it starts at 0.4"):
         schedules.linear(0.2, 0.4, 0.1)

@@ -36,11 +36,14 @@ def whole(tmp_path_factory):
 
 
 def test_the_filter_follows_density_control_and_rests_at_the_end(whole):
-    module, _, _ = whole
+    module, _, folder = whole
     widths, cameras = module.smoothing.widths, [frame.camera for frame in module.scene.train.frames]
     assert len(widths) == len(module.splats) > 600
     now = 0.2**0.5 * sampling_intervals(module.splats.means.detach(), cameras)
-    assert torch.allclose(widths, now, rtol=0.05) and not torch.equal(widths, now)  # of step 18, not of step 24 or 30
+    assert torch.allclose(widths, now, rtol=0.05) and not torch.equal(widths, now)
+    # Those of step 18, not of step 24 or 30: a checkpoint between them has them, too.
+    later = load_checkpoint(folder / "checkpoints" / "step_000028.ckpt")["state_dict"]
+    assert torch.equal(later["smoothing.widths"], widths)
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(whole, tmp_path):

@@ -7,6 +7,7 @@ import json
 import pytorch_lightning as pl
 
 from heatsplat.geometry.transforms import camera_entry
+from heatsplat.io.files import write_atomically
 
 CAMERAS_FILE = "transforms.json"
 
@@ -27,4 +28,4 @@ class LearnedCameras(pl.Callback):
             entry = {"file_path": frame.name} | ({} if frame.time_s is None else {"time_s": frame.time_s})
             frames.append(entry | camera_entry(module.cameras.of(frame), origin))
         text = json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1)
-        (module.output_dir / CAMERAS_FILE).write_text(text, encoding="utf-8")
+        write_atomically(module.output_dir / CAMERAS_FILE, text)

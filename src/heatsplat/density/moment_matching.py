@@ -12,7 +12,6 @@ from heatsplat.geometry.rotations import matrices_to_quats, quats_to_matrices
 from heatsplat.splats import Splats
 
 MAX_OPACITY = 0.999  # of a merged Gaussian; renderers show no more
-KEPT = ((1, 2), (0, 2), (0, 1))  # axes that are left of a shape seen along each axis
 
 
 @dataclass(frozen=True)

@@ -69,12 +69,6 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     return viewmat
 
 
-def covariances(quats: Tensor, scales: Tensor) -> Tensor:
-    """Covariance matrices [..., 3, 3] in the world, R diag(scales²) Rᵀ, of quaternions wxyz and semi-axes [..., 3]."""
-    axes = quats_to_matrices(quats) * scales[..., None, :]
-    return axes @ axes.mT
-
-
 def clamped_slopes(points: Tensor, K: Tensor, width: int, height: int, margin: float) -> Tensor:
     """x/z and y/z [n, 2] of points in camera axes [n, 3], held within the image's field of view and a margin.
 

@@ -8,11 +8,6 @@ from __future__ import annotations
 import math
 
 
-def constant(progress: float, value: float = 1.0) -> float:
-    """The same weight at every step."""
-    return value
-
-
 def linear(progress: float, start: float, end: float, before: float = 0.0, after: float = 1.0) -> float:
     """The weight of a ramp: ``before`` until ``start``, then straight to ``after`` at ``end``, constant from there.
 

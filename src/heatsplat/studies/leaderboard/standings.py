@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 import re
 import statistics
@@ -21,8 +20,6 @@ from heatsplat.studies.leaderboard.earlier import EarlierSeeds, Place, add_earli
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.recorded import OVERRIDES, overrides_of
 from heatsplat.studies.score import COSTS, SCENES, TRUTH, SceneScore, score_scene
-
-log = logging.getLogger("heatsplat")
 
 SCORE_FILE, SUBMISSION = "score.json", "submission"
 WIDTH = 2.0  # standard errors of a difference below which two methods are tied
