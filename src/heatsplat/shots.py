@@ -286,7 +286,7 @@ def write_shot(
         log.warning("scene '%s' has no temperature bounds: files hold image values in [0, 1], not °C", scene.name)
     low, high = range_c or ((bounds.min_c, bounds.max_c) if bounds else (0.0, 1.0))
     bar = Bar(low, high, bar_unit(bounds))
-    stems = _stems([frame.name for frame in frames])
+    stems = file_stems([frame.name for frame in frames])
     clock = clock_of(scene)
     rows: list[tuple[str, float | None, float, float]] = []
     with files.videos:
@@ -340,7 +340,7 @@ def _write_table(path: Path, rows: Sequence[tuple[str, float | None, float, floa
         )  # fmt: skip
 
 
-def _stems(names: Sequence[str]) -> dict[str, str]:
+def file_stems(names: Sequence[str]) -> dict[str, str]:
     """What the files of frames are called, by name of the frame: with their folders where the names alone are not enough."""
     stems = {name: Path(name).stem for name in names}
     if len(set(stems.values())) == len(stems):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from fake_run import SECONDS, FakeModule, camera, evaluate, events, fit, loader, trainer, wall
+from fake_run import RANGE, SECONDS, FakeModule, camera, evaluate, events, fit, loader, trainer, wall
 from pytorch_lightning.callbacks import ModelCheckpoint
 
 from heatsplat.callbacks.images import ImagePanels, file_stem, panels
@@ -15,6 +15,7 @@ from heatsplat.callbacks.progress import Progress
 from heatsplat.callbacks.report import Report
 from heatsplat.contracts import SceneError, ViewSet, Weather
 from heatsplat.io.tables import read_csv
+from heatsplat.sensors.frame_offset import FrameOffset
 
 
 def scored(scene, folder, *callbacks):
@@ -265,6 +266,23 @@ def test_probes_of_the_scene_carry_their_names():
     named = replace(scene, notes={"probes": ["stove", "window"]})
     assert [probe.name for probe in find_probes(named, 6)] == ["stove", "window"]
     assert [probe.name for probe in find_probes(named, 1)] == ["stove"]
+
+
+def test_curves_of_cameras_that_were_trained_on_have_the_drift_of_their_moments(tmp_path):
+    """A camera's offset is the image's own where an image is trained on, and lies between neighbours elsewhere."""
+    scene = wall()
+    drift = FrameOffset()
+    drift.prepare(scene)
+    drift.raw_offset.data = torch.linspace(-1.0, 1.0, len(scene.train))
+
+    class Drifting(FakeModule):
+        def predict(self, frame):
+            return drift(super().predict(frame), frame).detach()
+
+    evaluate(Drifting(replace(scene, val=scene.train), tmp_path), trainer(tmp_path, [TemperatureCurves(times=6)]))
+    first, *_, last = read_csv(tmp_path / "renders" / "probes.csv")
+    cold = RANGE.to_celsius(0.1 + drift.offsets().detach())  # of the wall's right half, which stays as it is
+    assert (first["probe 2"], last["probe 2"]) == pytest.approx((cold[0].item(), cold[-1].item()), abs=1e-3)
 
 
 def test_dots_stand_for_the_truth_on_real_scenes(tmp_path):

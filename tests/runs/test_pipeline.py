@@ -17,6 +17,8 @@ from heatsplat.io.results import METRICS_FILE
 from heatsplat.runs.checks import checked
 from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import differences, on_scene, resumed
+from heatsplat.sensors.base import SensorChain
+from heatsplat.sensors.frame_offset import FrameOffset
 from heatsplat.training.checkpoints import load_checkpoint
 
 QUICK = (
@@ -88,6 +90,21 @@ def test_what_was_seen_is_told_of_the_image_that_is_rendered(trained, monkeypatc
     assert not torch.equal(*expected.values())
     monkeypatch.setattr(scene.module.cameras, "of", lambda frame: other.camera)
     assert torch.equal(scene.seen(frame), expected[other.camera])
+
+
+def test_a_training_camera_at_another_moment_has_the_drift_of_that_moment(trained, monkeypatch):
+    scene = heatsplat.load(trained[0] / "checkpoints" / "last.ckpt")
+    drift, (first, *_, last) = FrameOffset(), scene.scene.train.frames
+    drift.prepare(scene.scene)
+    drift.raw_offset.data = torch.linspace(-0.5, 0.5, len(drift.raw_offset))
+    clean = scene.images(first, ["recorded"])["recorded"]
+    monkeypatch.setattr(scene.module, "sensor", SensorChain({"drift": drift}))
+    early, late = drift.offsets()[[0, -1]].tolist()
+    bounds = scene.scene.thermal_range
+    assert torch.equal(scene.images(first, ["recorded"])["recorded"], (clean + early).clamp(0, 1))
+    for frame in (replace(first, time_s=last.time_s), replace(first, time_s=1e6)):
+        assert torch.equal(scene.images(frame, ["recorded"])["recorded"], (clean + late).clamp(0, 1))
+    assert torch.equal(scene.render(first, last.time_s, "keep"), bounds.to_celsius((clean + late).clamp(0, 1))[..., 0])
 
 
 def test_a_step_changes_no_configuration_that_it_is_given(trained):

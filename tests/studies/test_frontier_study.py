@@ -275,6 +275,12 @@ def test_levels_are_those_asked_for(runs, tmp_path, no_pictures):
     assert "| seconds to | 21.5 dB | 29 dB |\n" in text
 
 
+def test_a_level_that_every_seed_has_at_its_first_validation_is_left_out(runs, tmp_path, no_pictures):
+    made(tmp_path / "slow", "etgs", ["seed=2", "max_steps=9"], [(2, 20), (6, 31)], 7.0, 31.0)
+    run(tmp_path / "out", str(runs), psnr_levels_db=[15, 21.5], mae_levels_c=[])
+    assert "| seconds to | 21.5 dB |\n" in (tmp_path / "out" / "frontier.md").read_text()
+
+
 @pytest.mark.parametrize("levels", [30, None, "30", [20, -1], [True], ["20"], [float("nan")], {"a": 1}])
 @pytest.mark.parametrize("name", LEVELS)
 def test_levels_that_are_none_are_refused(runs, tmp_path, name, levels):

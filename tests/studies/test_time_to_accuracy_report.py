@@ -1,5 +1,7 @@
 """What the time to an accuracy is shown as: cells over seeds, records, and a picture near the ends."""
 
+from dataclasses import replace
+
 import pytest
 from test_time_to_accuracy_runs import a_panel, outcome
 
@@ -12,6 +14,14 @@ def test_the_standard_schedule_stands_below_each_recipe_that_lies_between_its_ru
     names = [line.split("|")[1].strip() for line in ends(panel)[2:]]
     same = "– standard in the same time"
     assert names == ["standard, 800 steps (reference)", "standard, 100 steps", "early", same, "late", same, "slow"]
+
+
+def test_seeds_of_a_recipe_are_one_row_whatever_their_lengths():
+    panel = a_panel()
+    panel.references["1"] = replace(panel.references["0"], seed="1")
+    panel.outcomes += [outcome("budget", 300, 30.0, 40.0), replace(outcome("budget", 311, 30.0, 42.0), seed="1")]
+    (row,) = [line for line in ends(panel) if "budget" in line]
+    assert row.startswith("| budget | 2 | ≈ 306 | 30.0 ± 0.0 |") and "41.00 ± 1.41" in row
 
 
 def test_times_have_a_dash_where_the_accuracy_is_not_reached():

@@ -37,6 +37,12 @@ def test_the_standard_schedule_lies_on_a_line_over_log_seconds_and_never_beyond_
     assert panel.standard_in(outcome("x", 1, 9.9, 0.0)) is None is panel.standard_in(outcome("x", 1, 80.1, 0.0))
 
 
+def test_what_is_as_good_as_the_standard_schedule_in_its_time_takes_as_long():
+    panel, seconds = a_panel(), 40.0
+    panel.margins = {"psnr": 41.0 - panel.standard_in(outcome("x", 1, seconds, 0.0)).scores["psnr"], "mae_c": 0.02}
+    assert panel.measures(outcome("x", 1, seconds, 40.0))["end_psnr_of_own"] == pytest.approx(1.0)
+
+
 def test_what_never_gets_as_far_has_no_time_to_it():
     panel = a_panel()
     late, early = (panel.measures(one) for one in panel.outcomes[:2])

@@ -87,8 +87,8 @@ def test_recipes_are_measured_by_the_reference_of_their_seed(runs, tmp_path, no_
         assert float(row["way_psnr"]) == pytest.approx(10 + 10 * 9.8 / 11)
         own = 40 + 20 * 1.8 / 1.9
         assert float(row["way_psnr_of_own"]) == pytest.approx((10 + 10 * 9.8 / 11) / own)
-        # by ends the standard schedule is within 0.2 dB of 41 after 40 + 40 · 1.8 / 2 s
-        assert float(row["end_psnr_of_own"]) == pytest.approx(seconds / (40 + 40 * 1.8 / 2))
+        # by ends the standard schedule is within 0.2 dB of 41 on 1.8 / 2 of the way from 40 to 80 s, over log seconds
+        assert float(row["end_psnr_of_own"]) == pytest.approx(seconds / (40 * 2 ** (1.8 / 2)))
     short = by_recipe(tmp_path / "out")["standard, 100 steps"]
     assert short["end_psnr"] == short["way_psnr"] == ""  # never as good
 
@@ -134,7 +134,7 @@ def test_methods_and_scenes_have_panels_and_references_of_their_own(runs, tmp_pa
     made(runs / "other", ["max_steps=800"], 800, 60.0, 33.0, method="3dgs")
     made(runs / "other_quick", ["preset=fast", "seed=0"], 200, 6.0, 32.0, method="3dgs")
     made(runs / "lone", ["preset=fast", "seed=7"], 200, 6.0, 32.0, method="3dgs")
-    made(runs / "twice", ["preset=fast", "seed=0", "threads=2"], 200, 1.0, 32.0, method="3dgs")
+    made(runs / "twice", ["preset=fast", "seed=0", "threads=2"], 190, 1.0, 32.0, method="3dgs")
     panels = {panel.title: panel for panel in run(tmp_path / "out", str(runs), REFERENCE, RECIPES)}
     assert set(panels) == {"etgs on heated", "3dgs on heated"}
     found = panels["3dgs on heated"]

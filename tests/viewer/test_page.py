@@ -316,6 +316,19 @@ def test_the_hottest_and_the_coldest_spot_are_those_of_the_picture(page):
     assert page.execute_script("return document.querySelectorAll('#marks .spot').length") == 0
 
 
+def test_spots_of_what_was_learned_are_those_of_the_whole_picture(page):
+    """Nothing stands beside it, so that there is no divider either."""
+    page.execute_script("viewer.goTo(0); viewer.choose({quantity: 'learned time_constant_s', other: 'nothing'})")
+    wait_until(page, "!viewer.sorter.busy && !viewer.stale.order")
+    found = page.execute_script("""const v = viewer, told = [];
+      for (const other of ['nothing', 'time']) {
+        v.choose({other, how: 'swipe', split: 0.05}); v.frame(performance.now());
+        told.push([v.extremes(), v.shownName]);
+      }
+      return told;""")
+    assert found[0] == found[1] and found[0][1] == "time constant"
+
+
 def test_curves_and_the_picture_can_be_kept(page):
     page.execute_script("viewer.probes.list = []; viewer.goTo(0); viewer.probes.pin(...viewer.middle())")
     head, *rows = page.execute_script("return viewer.probes.table()").strip().split("\n")
@@ -494,6 +507,21 @@ def test_a_second_run_is_itself_whatever_its_clock(new_page, folder, tmp_path):
     assert "Images do not tell" in wait_until(new_page, "viewer.said")
     new_page.execute_script("viewer.frame(performance.now())")
     assert "Images do not tell" in new_page.execute_script(run_note)
+
+
+def test_a_second_run_has_no_values_that_its_image_cannot_hold_either(browser, folder, tmp_path):
+    header, block = parts_of(folder / FILE)
+    low, high = header["limits"]
+    header["limits"] = [low + 0.4 * (high - low), low + 0.6 * (high - low)]
+    (tmp_path / FILE).write_text(pages.page(header, block), encoding="utf-8")
+    page = opened(browser, tmp_path / FILE)
+    page.find_element("id", "run").send_keys(str(tmp_path / FILE))
+    wait_until(page, "viewer.run && viewer.run.scene.ready && viewer.state.other === 'run'")
+    page.execute_script("viewer.choose({how: 'difference'}); viewer.frame(performance.now())")
+    values = np.array(page.execute_script("return viewer.sampled()"))
+    assert len(values) > 1000 and np.abs(values).max() < 0.01
+    page.execute_script("viewer.state.ranges[viewer.rangeName] = [-1, 1]")
+    assert len(np.unique(pixels(page).round(-1), axis=0)) <= 3  # the middle of the colours, and paper
 
 
 def test_a_second_run_of_another_day_scene_or_place_says_so(new_page, folder, tmp_path):

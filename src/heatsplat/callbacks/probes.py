@@ -16,6 +16,7 @@ from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, evenly_spread
 from heatsplat.io.pictures import figure_picture, literal, write_png
 from heatsplat.io.quantities import clock_of, time_unit
 from heatsplat.io.tables import write_csv
+from heatsplat.shots import first_free_id
 
 PROBES_PICTURE = "renders/probes.png"
 CANDIDATES = 16  # validation cameras that are tried for a view of the probes
@@ -102,12 +103,13 @@ class TemperatureCurves(pl.Callback):
 
     def _rendered(self, module: pl.LightningModule, times: Tensor) -> np.ndarray:
         """Image values of the probes' pixels, [n, F] float64; one render per camera and time serves all its probes."""
-        values = np.empty((len(self._probes), len(times)))
+        values, free_id = np.empty((len(self._probes), len(times))), first_free_id(module.scene)
         for frame_id in {probe.frame.frame_id for probe in self._probes}:
             seen = [i for i, probe in enumerate(self._probes) if probe.frame.frame_id == frame_id]
             frame = self._probes[seen[0]].frame
             for j, time_s in enumerate(times.tolist()):
-                image = module.predict(replace(frame, time_s=time_s)).mean(-1)
+                # At another moment it is no training image, whose own settings of the camera a part of the sensor may know.
+                image = module.predict(replace(frame, frame_id=free_id, time_s=time_s)).mean(-1)
                 rows, columns = ([getattr(self._probes[i], axis) for i in seen] for axis in ("row", "column"))
                 values[seen, j] = image[rows, columns].double().cpu().numpy()
         return values

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
 
 from heatsplat.io.tiff import write_temperature
+from heatsplat.shots import file_stems
 
 
 class TemperatureRenders(pl.Callback):
     """Writes every test view's render, in °C, to ``folder``/<name of the view>.tiff; nothing without a thermal range.
+
+    Names have the folders of their images where test views of several folders are called alike (``shots.file_stems``).
 
     Args:
         folder: in the run's folder.
@@ -26,5 +28,5 @@ class TemperatureRenders(pl.Callback):
         if bounds is None:
             return
         image = outputs["companions"].get(self.image, outputs["prediction"])
-        path = module.output_dir / self.folder / f"{Path(outputs['view'].frame.name).stem}.tiff"
-        write_temperature(path, bounds.to_celsius(image.cpu()))
+        stem = file_stems([frame.name for frame in module.scene.test.frames])[outputs["view"].frame.name]
+        write_temperature(module.output_dir / self.folder / f"{stem}.tiff", bounds.to_celsius(image.cpu()))

@@ -217,7 +217,7 @@ class Trained:
         frame = camera if isinstance(camera, Frame) else Frame("view", first_free_id(self.scene), camera)
         frame = frame if time_s is None else at_time(self.scene, frame, time_s)
         self._warned = self._warned or warn_beyond_record(self.scene, [frame], self.module.thermal.beyond_record)
-        image = self.module.predict(frame).cpu()
+        image = self.module.predict(self._at_its_moment(frame)).cpu()
         bounds = self.scene.range_of(self.module.modality)
         if bounds is not None and image.shape[2] == 1:
             image = bounds.to_celsius(image)
@@ -239,7 +239,7 @@ class Trained:
 
     def images(self, frame: Frame, names: Sequence[str]) -> dict[str, Tensor]:
         """Images [H, W, C] in [0, 1] of a frame by name, on the CPU."""
-        found = self.module.predict_all(frame)
+        found = self.module.predict_all(self._at_its_moment(frame))
         found["recorded"] = found[self.module.modality]
         return {name: found[name].cpu() for name in names}
 
@@ -252,6 +252,18 @@ class Trained:
     def depth(self, frame: Frame) -> Tensor:
         """Camera z [H, W] of the surface in a frame, in world units; infinite where there is none."""
         return self.module.depth(frame)
+
+    @torch.no_grad()
+    def _at_its_moment(self, frame: Frame) -> Frame:
+        """The frame; of a training camera at another moment than its image one that is no training image. What the model knows of
+        that image, such as how far the camera had drifted, is not true then; where the camera stood is."""
+        if self._taken_s.get(frame.frame_id) in (None, frame.time_s):
+            return frame
+        return replace(frame, camera=self.module.cameras.of(frame), frame_id=first_free_id(self.scene))
+
+    @cached_property
+    def _taken_s(self) -> dict[int, float | None]:
+        return {frame.frame_id: frame.time_s for frame in self.scene.train.frames}
 
     @cached_property
     def _sightings(self) -> list[Sighting]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -26,10 +27,8 @@ WITH_SPREAD = {"train_seconds", "psnr", "mae_c"}  # beside the mean
 def _reached(recipes: Sequence[Recipe], name: str, levels: Sequence[float]) -> list[float]:
     """The levels that some recipe reaches and not all reach at their first validation."""
     reached = [[recipe.seconds_to(name, level) for recipe in recipes] for level in levels]
-    starts = [
-        min((course[name][0][0] for course in recipe.table["course"] if course[name]), default=0.0)
-        for recipe in recipes
-    ]
+    firsts = [[course[name][0][0] for course in recipe.table["course"] if course[name]] for recipe in recipes]
+    starts = [statistics.fmean(first) if first else 0.0 for first in firsts]
     return [
         level
         for level, times in zip(levels, reached, strict=True)

@@ -47,12 +47,20 @@ def ends(panel: Panel) -> list[str]:
     head += ["Gaussians", "of the reference's"]
     rows = []
     for own in panel.groups():
-        rows.append([named(panel, own[0]), str(len(own)), f"{own[0].steps:,}", *_end_cells(panel, own, scores)])
+        rows.append([named(panel, own[0]), str(len(own)), _steps(own), *_end_cells(panel, own, scores)])
         usual = [found for one in own if one.recipe is not None and (found := panel.standard_in(one)) is not None]
         if usual and len(usual) == len(own):
-            steps = f"≈ {round(statistics.fmean(one.steps for one in usual)):,}"
+            steps = f"≈ {_mean_steps(usual):,}"
             rows.append(["– standard in the same time", str(len(usual)), steps, *_end_cells(panel, usual, scores)])
     return markdown_table(head, rows, "l" + "r" * (len(head) - 1))
+
+
+def _steps(own: Sequence[Outcome]) -> str:
+    return f"{own[0].steps:,}" if len({one.steps for one in own}) == 1 else f"≈ {_mean_steps(own):,}"
+
+
+def _mean_steps(own: Sequence[Outcome]) -> int:
+    return round(statistics.fmean(one.steps for one in own))
 
 
 def _end_cells(panel: Panel, own: Sequence[Outcome], scores: Sequence[str]) -> list[str]:

@@ -42,6 +42,11 @@ class Outcome:
     gaussians: float
     course: dict[str, list[tuple[float, float]]]
 
+    @property
+    def kind(self) -> tuple[str | None, int | None]:
+        """What runs that differ in the seed only have in common. A recipe may leave its length to each run, as budget does."""
+        return self.recipe, self.steps if self.recipe is None else None
+
 
 @dataclass
 class Panel:
@@ -61,9 +66,9 @@ class Panel:
 
     def groups(self) -> list[list[Outcome]]:
         """Runs that differ in the seed only: the reference, shorter standard runs, then recipes by their time."""
-        groups: dict[tuple[str | None, int], list[Outcome]] = {}
+        groups: dict[tuple[str | None, int | None], list[Outcome]] = {}
         for one in self.outcomes:
-            groups.setdefault((one.recipe, one.steps), []).append(one)
+            groups.setdefault(one.kind, []).append(one)
 
         def order(own: list[Outcome]) -> tuple[bool, float]:
             return own[0].recipe is not None, -own[0].steps if own[0].recipe is None else own[0].seconds
@@ -82,7 +87,8 @@ class Panel:
         """What a run is beside the reference of its seed; ``way_*``: by courses, ``end_*``: by ends, None where not reached.
 
         ``*_of_own`` are parts of the time in which the standard schedule gets as far: on the reference's course, or by
-        the ends of standard runs of any length; ``*_of_all`` are parts of the reference's whole time.
+        the ends of standard runs of any length, on the line of ``standard_in``; ``*_of_all`` are parts of the reference's
+        whole time.
         """
         reference = self.references[one.seed]
         found: dict[str, float | None] = {
@@ -96,10 +102,12 @@ class Panel:
             way = own = None
             if level is not None:
                 way, own = seconds_to(one.course[score], level, higher), seconds_to(course, level, higher)
-            ends = [(each.seconds, each.scores[score]) for each in self.standard(one.seed)]
+            ends = [(math.log(each.seconds), each.scores[score]) for each in self.standard(one.seed)]
             level = self.level(score, reference.scores[score])
             end = one.seconds if (value >= level if higher else value <= level) else None
-            for name, seconds, usual in (("way", way, own), ("end", end, seconds_to(ends, level, higher))):
+            reached = seconds_to(ends, level, higher)
+            shortest = None if reached is None else math.exp(reached)
+            for name, seconds, usual in (("way", way, own), ("end", end, shortest)):
                 found[f"{name}_{score}"] = seconds
                 found[f"{name}_{score}_of_own"] = _ratio(seconds, usual)
                 found[f"{name}_{score}_of_all"] = _ratio(seconds, reference.seconds)
@@ -184,7 +192,7 @@ def panels_of(
             if outcome is None:
                 log.warning("%s is left out: it does not tell its %s, PSNR and Gaussians", one.folder, clock)
                 continue
-            if (key := (name, outcome.steps, outcome.seed)) in seen:
+            if (key := (*outcome.kind, outcome.seed)) in seen:
                 log.warning("%s is left out: another run of its recipe and seed was read before", one.folder)
                 continue
             seen.add(key)

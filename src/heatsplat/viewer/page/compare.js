@@ -79,14 +79,19 @@ class SecondRun {
 
   // Values of a quantity at a moment of the first run.
   fill(quantity, time) {
-    this.splats.fill(this.splats.layer(quantity) || this.splats.layers[0], time + this.later, this.scene.filled, 0, 2);
+    this.layer = this.splats.layer(quantity) || this.splats.layers[0];
+    this.splats.fill(this.layer, time + this.later, this.scene.filled, 0, 2);
     this.drawing.update(this.scene);
+  }
+
+  // Whether values are those of its image, which holds none outside of its range.
+  get clamped() {
+    return this.layer?.name === "camera";
   }
 
   // The value of a pixel, from what was blended from the place j on; null where next to nothing was.
   valueOf(blended, j) {
-    const alpha = blended[j + 3], [low, high] = this.told.tableEnds;
-    if (alpha < 0.05) return null;
-    return this.splats.decoded(alpha * low + blended[j] * (high - low) + (1 - alpha) * this.told.background);
+    const alpha = blended[j + 3];
+    return alpha < 0.05 ? null : this.splats.valueOf(blended[j], alpha, this.layer);
   }
 }

@@ -75,7 +75,7 @@ const SHOW_FRAGMENT = `#version 300 es
 precision highp float;
 precision highp sampler2D;
 uniform sampler2D first, second, visible, table, secondTable, map, differences, picture;
-uniform vec2 range, spread, limits, learned, background;  // background: of first and second
+uniform vec2 range, spread, limits, limitsOfRun, learned, background;  // background: of first and second
 uniform vec3 paper;
 uniform vec4 frame;          // left, top, width, height of the camera's image on the canvas
 uniform int kind, other;     // kind: 0 temperature, 1 attribute, 2 visible light; other: see below
@@ -126,6 +126,7 @@ void main() {
   } else if (other == RUN) {
     vec4 b = texelFetch(second, at, 0);
     beside = decoded(secondTable, b.r + (1.0 - b.a) * background.y);
+    if (clampSecond) beside = clamp(beside, limitsOfRun.x, limitsOfRun.y);
     if (difference) alpha = min(alpha, b.a);
     else if (corner.x > split) alpha = b.a;
   } else if (other == RECORDED || other == SENSOR) {

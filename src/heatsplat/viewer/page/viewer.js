@@ -73,9 +73,9 @@ class Viewer {
     return this.differing ? `difference ${this.state.other}` : this.attribute ? this.state.quantity : "values";
   }
 
-  // What stands beside it, of which images of cameras are known at their places and times alone.
+  // What stands beside it, of which images of cameras are known at their places and times alone; nothing does beside what was learned.
   get beside() {
-    return this.ofCamera && !this.atImage ? "nothing" : this.state.other;
+    return this.attribute || (this.ofCamera && !this.atImage) ? "nothing" : this.state.other;
   }
 
   // Whether this is the place and the time of the image of a training camera.
@@ -347,7 +347,7 @@ class Viewer {
 
   paint() {
     const { drawing, scene, state, view, told } = this, { width } = $("canvas");
-    const other = this.layer || state.quantity === "visible" ? this.beside : "nothing";
+    const other = this.beside;
     const picture = this.pictureBeside(other);
     const textures = { table: scene.table, map: this.maps[state.map].texture, differences: this.maps[DIFFERENCES].texture, picture };
     textures.first = drawing.blend(scene, view, "first").texture;
@@ -368,12 +368,13 @@ class Viewer {
         other: same ? 1 : kinds[other],
         difference: this.differing,
         clampFirst: state.quantity === "camera",
-        clampSecond: other === "camera" || (other === "time" && state.quantity === "camera"),
+        clampSecond: other === "camera" || (other === "time" && state.quantity === "camera") || (other === "run" && this.run?.clamped),
       },
       floats: {
         range: this.differing ? [0, 1] : this.range,
         spread: this.differing ? this.range : [-1, 1],
         limits: told.limits,
+        limitsOfRun: this.run ? this.run.told.limits : told.limits,
         learned: attribute ? [attribute.low, attribute.high] : [0, 1],
         background: [behind(told), this.run ? behind(this.run.told) : 0],
         paper,
