@@ -292,6 +292,21 @@ def test_gaussians_of_a_pixel_that_disagree_make_it_less_certain():
     assert (disagree[seen].double() / exact - 1).abs().max() < 0.35  # 32 draws
 
 
+@pytest.mark.parametrize("known", [0, 1])
+def test_gaussians_without_a_value_make_others_neither_more_nor_less_certain(known):
+    """Of two, the first of which has most of the pixels that show both."""
+    frame, told = replace(FRAME, frame_id=1), levels([0.2, 0.4])
+    expected, seen = told.of_attributes(frame)["double"][known], told.attribute_deviations(frame)["double"].isfinite()
+    one = torch.arange(2) == known
+    told.module.thermal.attributes = lambda splats, query: {"double": torch.where(one, 2 * splats["level"], torch.nan)}
+    each, pixels = (found["double"] for found in (told.of_attributes(frame), told.attribute_deviations(frame)))
+    assert each[known] == expected and each[1 - known].isnan()
+    if known == 1:
+        assert pixels.isnan().all()
+    else:
+        torch.testing.assert_close(pixels[seen], expected.expand(int(seen.sum())))
+
+
 @pytest.mark.parametrize("kept, expected", [(0.0, 1.0), (0.5, 3.0), (0.8, 9.0)])
 def test_views_whose_errors_are_alike_count_as_fewer(kept, expected):
     """Of a chain in which each keeps a share of the one before the autocorrelation time is (1 + share) / (1 - share)."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Frame, SceneData, SceneError, View, ViewSet
-from heatsplat.geometry.coverage import Sighting, covered
+from heatsplat.geometry.coverage import Sighting, covered, seen_means
 from heatsplat.physics.noise import noise_of_views
 from heatsplat.shots import at_time, sightings
 from heatsplat.thermal.base import Query
@@ -234,11 +234,13 @@ class Uncertainty:
         air temperature, and what an observed surface is that the model's is not.
 
         What neither a Gaussian's numbers nor a doubt change, such as how much of all heat the air lets pass, has none: it is no
-        more certain than what the whole scene has in common, of which this knows nothing. Empty for models that tell nothing, and
-        for those of which a Gaussian has more numbers than such a block can hold, or not all the same.
+        more certain than what the whole scene has in common, of which this knows nothing. NaN where a Gaussian has no value. Empty
+        for models that tell nothing, and for those of which a Gaussian has more numbers than such a block can hold, or not all
+        the same.
         """
         module, count = self.module, len(self.module.splats)
-        names = list(module.attributes(frame))
+        told = module.attributes(frame)
+        names = list(told)
         if not names:
             return {}
         whole = _Block(module)
@@ -258,7 +260,8 @@ class Uncertainty:
             block.learn(frames, weights[:, part], repeated, spread)
             for name in names:
                 deviations[name][part] = block.deviation(name, frame)
-        return {name: found for name, found in deviations.items() if bool((found != 0).any())}
+        found = {name: one.where(told[name].isfinite().cpu(), torch.nan) for name, one in deviations.items()}
+        return {name: one for name, one in found.items() if bool((one.nan_to_num() != 0).any())}
 
     def _weighed_views(self) -> tuple[list[Frame], Tensor, float]:
         """Frames of the training views in the order of time, the information [V, N] float32 that each has of a Gaussian's
@@ -279,7 +282,7 @@ class Uncertainty:
         A pixel shows the mean of its Gaussians, which are taken to err together by what each is uncertain, as one surface;
         that they disagree on top tells what none of them knows of itself, for each was certain with the others as they are.
         It counts as it would in a mean of independent ones: the spread of that mean under random signs of their departures
-        (a wild bootstrap over Gaussians).
+        (a wild bootstrap over Gaussians). Those that have no value count in neither; NaN where they are most of a pixel.
         """
         module, deviations = self.module, self.of_attributes(frame)
         if not deviations:
@@ -288,10 +291,14 @@ class Uncertainty:
         signs = torch.randn(len(module.splats), DRAWS, generator=torch.Generator().manual_seed(0)).sign()
         found = {}
         for name, deviation in deviations.items():
-            values = told[name].detach().nan_to_num().cpu()[:, None]
-            columns = torch.cat([values, deviation.nan_to_num()[:, None], signs, signs * values], dim=1)
+            values = told[name].detach().cpu()[:, None]
+            known = values.isfinite() & deviation.isfinite()[:, None]
+            columns = torch.cat([values, deviation[:, None], signs, signs * values], dim=1).where(known, 0.0)
+            count = columns.shape[1]
+            if not known.all():
+                columns = torch.cat([columns, known.to(columns)], dim=1)
             seen = module.composited(frame, columns.to(module.device))
-            blended = (seen.features / seen.alpha[0][..., None]).cpu()
+            blended = seen_means(seen.features, seen.alpha[0], count).cpu()
             mean, together, drawn = blended[..., :1], blended[..., 1], blended[..., 2:]
             apart = (drawn[..., DRAWS:] - mean * drawn[..., :DRAWS]).square().mean(-1)
             found[name] = (together.square() + apart).sqrt()
