@@ -15,7 +15,7 @@ from heatsplat.datamodules.base import CELSIUS, Counts, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
-from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius
+from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius, read_thermal
 from heatsplat.datamodules.frame_times import FRAMES_FILE, FrameTimes
 from heatsplat.datamodules.points import random_points, told_random
 from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames
@@ -180,7 +180,7 @@ class Colmap(SceneDataModule):
                 )
             if having:
                 return read_celsius, CELSIUS, "temperatures of radiometric JPEGs (emissivity 1, no atmosphere)"
-        return read_image, None, "greys, linear between the bounds where there are any"
+        return read_thermal, None, "greys, linear between the bounds where there are any"
 
     def _bounds(self, folder: Path) -> tuple[ThermalRange | None, str]:
         if self.bounds_c is not None:

@@ -32,6 +32,7 @@ from heatsplat.datamodules.formats.nerfstudio import (
     time_in,
     viewmat_of,
 )
+from heatsplat.datamodules.formats.radiometric import read_thermal
 from heatsplat.datamodules.frame_times import FrameTimes
 from heatsplat.datamodules.points import ply_points, random_points, told_random
 from heatsplat.datamodules.posed_frames import told_missing
@@ -175,7 +176,7 @@ class Nerfstudio(SceneDataModule):
                 missing.append(str(entry.frame["file_path"]))
                 continue
             rgb_file = entry.visible if self.rgb or photos else None
-            read = partial(read_image, folder / main)
+            read = partial(read_thermal, folder / main)
             name = main if with_folders else PurePosixPath(main).name
             frames.append(
                 RawFrame(

@@ -14,8 +14,9 @@ from heatsplat.contracts import SceneError, counted
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.formats import temperature_table
 from heatsplat.datamodules.formats.colmap import SparseModel
-from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.formats.images import ImageIndex
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
+from heatsplat.datamodules.formats.radiometric import read_thermal
 from heatsplat.datamodules.points import obj_vertices, random_points, told_random
 
 log = logging.getLogger(__name__)
@@ -85,7 +86,7 @@ def model_frames(
     model: SparseModel,
     files: Mapping[str, str | None],
     images: Path,
-    read: Callable[[Path], np.ndarray] | None = read_image,
+    read: Callable[[Path], np.ndarray] | None = read_thermal,
     describe: Callable[[str], dict[str, Any]] | None = None,
 ) -> list[RawFrame]:
     """The frames of a sparse model that have a file, in the order of the model, with their masks.
@@ -143,7 +144,7 @@ def listed_frames(
             if file is None:
                 missing.append(str(path))
                 continue
-            read = partial(read_image, folder / file)
+            read = partial(read_thermal, folder / file)
             # Some frames carry their own field of view; the file's holds for the others.
             fov = {"camera_angle_x": frame["FovX"]} if "FovX" in frame else {}
             frames.append(

@@ -12,7 +12,7 @@ from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.dji import PER_KELVIN
 from heatsplat.datamodules.formats.images import tiff_text
-from heatsplat.datamodules.formats.radiometric import Calibration
+from heatsplat.datamodules.formats.radiometric import CELSIUS_OF_FAHRENHEIT, Calibration
 from heatsplat.datamodules.side_files import says_fahrenheit
 from heatsplat.physics.planck import Band
 from heatsplat.physics.radiometry import BandResponse, PlanckResponse
@@ -141,7 +141,7 @@ class Meaning:
             return self.of_temperatures(scale, offset), f"floats: °C = {scale:g} * value {offset:+g}"
         if says_fahrenheit(tiff_text(path)):
             raise SceneError(
-                f"{path} says that its numbers are °F: give counts.scale={1 / 1.8:.6f} counts.offset_c={-32 / 1.8:.4f}, or "
+                f"{path} says that its numbers are °F: give {CELSIUS_OF_FAHRENHEIT}, or "
                 "counts.offset_c=0 where they are °C all the same"
             )
         finite = sample[np.isfinite(sample)]

@@ -100,7 +100,11 @@ class Writer:
         if (before := done.get("file")) in {f"{frame.name}.{end}" for end in ENDINGS} - {image_name(frame)}:
             # Greys that have become temperatures, or the other way round: two images of one name would be taken for each other.
             (self.images / before).unlink(missing_ok=True)
-            (self.target / "masks" / f"{before}.png").unlink(missing_ok=True)
+            self._mask_of(before).unlink(missing_ok=True)
+        if (
+            done.get("dead_pixels") and frame.name not in self.dead
+        ):  # the mask is ours, and sound pixels would be left out
+            self._mask_of(image_name(frame)).unlink(missing_ok=True)
         record = self._record(frame, pixels) | {"made_of": made_of}
         write_atomically(record_file, json.dumps(record, indent=1, allow_nan=False) + "\n")
         return record, True
@@ -132,6 +136,7 @@ class Writer:
             "attitude": asdict(frame.attitude) if frame.attitude else None,
             "photo": str(self.photo_of(frame) if frame.picture is not None else frame.rgb or "") or None,
             "unknown_pixels": int((~finite).sum()),
+            "dead_pixels": int(self.dead[frame.name].sum()) if frame.name in self.dead else 0,
             "quantiles": [float(q) for q in np.quantile(known.astype(np.float64), QUANTILES)] if known.size else None,
         }
         if frame.calibration is None:
@@ -171,7 +176,10 @@ class Writer:
         for frame in frames:
             if frame.name in self.dead:
                 mask = cv2.imencode(".png", np.where(self.dead[frame.name], 0, 255).astype(np.uint8))[1]
-                self._replace(self.target / "masks" / f"{self.image_of(frame).name}.png", mask)
+                self._replace(self._mask_of(image_name(frame)), mask)
+
+    def _mask_of(self, image: str) -> Path:
+        return self.target / "masks" / f"{image}.png"
 
     def finish(self, frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]]) -> None:
         """Writes what belongs to the recording as a whole: frames.csv, temperature_bounds.json."""

@@ -15,6 +15,8 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats import dji, flir
+from heatsplat.datamodules.formats.images import read_image, tiff_text
+from heatsplat.datamodules.side_files import says_fahrenheit
 from heatsplat.physics.radiometry import BandResponse, Conditions, Response, surface_temperature
 from heatsplat.physics.units import KELVIN_AT_0_C
 
@@ -51,6 +53,8 @@ class Calibration:
 
 
 CELSIUS = Calibration(scale=1.0)
+# Settings of a preparation that make °C of °F.
+CELSIUS_OF_FAHRENHEIT = f"counts.scale={1 / 1.8:.6f} counts.offset_c={-32 / 1.8:.4f}"
 
 
 def surface_celsius(stored: np.ndarray, calibration: Calibration, conditions: Conditions | None = None) -> np.ndarray:
@@ -91,3 +95,19 @@ def read_celsius(path: Path) -> np.ndarray:
     if (counts := dji.array_of(data)) is not None:
         return dji.temperatures(counts, path)
     raise SceneError(f"{path} carries no raw data of FLIR or DJI; use it as a plain image (data.radiometric=never)")
+
+
+def read_thermal(path: Path) -> np.ndarray:
+    """The pixels of a thermal image as they are stored (``read_image``); floating-point ones are °C.
+
+    Raises:
+        SceneError: as ``read_image``, or a floating-point TIFF says that its numbers are °F.
+    """
+    pixels = read_image(path)
+    if pixels.dtype == np.float32 and says_fahrenheit(tiff_text(path)):
+        raise SceneError(
+            f"{path} says that its numbers are °F, and °C are read. Make a scene in °C of the images: python src/prepare.py "
+            f"source={path.parent} target=NEW_FOLDER {CELSIUS_OF_FAHRENHEIT} poses=given poses.model=THIS_SCENE "
+            "(counts.offset_c=0 alone where they are °C all the same)"
+        )
+    return pixels

@@ -93,12 +93,43 @@ def test_what_is_simulated_comes_first_and_one_reason_is_said_once():
     *table, empty, below = effects_table(effects)
     cells = [[cell.strip() for cell in line.strip("|").split("|")][:2] for line in table[2:]]
     assert cells == [
-        ["fixed_pattern", "**yes**"],
-        ["frame_offset", "yes, but cannot be told"],
-        ["relaxation", "cannot be told"],
-        ["agc", "no"],
-        ["reflection", "no"],
+        ["fixed pattern of the pixels (`fixed_pattern`)", "**yes**"],
+        ["offset of each image (`frame_offset`)", "yes, but cannot be told"],
+        ["relaxation to the surroundings (`relaxation`)", "cannot be told"],
+        ["gain of each image (`agc`)", "no"],
+        ["mirrored surroundings (`reflection`)", "no"],
     ]
-    assert (empty, below) == ("", "- solar, albedo: no; the scene lacks weather")
+    left_out = "- absorbed sunlight (`solar`), sunlight from the ground (`albedo`): no; the scene lacks weather"
+    assert (empty, below) == ("", left_out)
     alone = {name: effects[name] for name in ("solar", "albedo")}
     assert effects_table(alone) == [below]
+
+
+def test_the_run_is_told_in_words_beside_its_names(tmp_path):
+    run = {
+        "method": "auto", "scene": "hall", "seed": 0, "thermal_model": "Composed", "averaged_updates": 7,
+        "camera_check": {"moved_px": 0.25, "error_falls": 0.031}, "machine": "two cores",
+    }  # fmt: skip
+    text = markdown(RunResults(run=run), tmp_path, [], None)
+    told = text[text.index("## The run") : text.index("## Simulated effects")]
+    assert told.split("\n\n")[1].splitlines() == [
+        "- method: auto", "- scene: hall", "- seed: 0", "- thermal model (`thermal_model`): Composed",
+        "- updates that the final weights average (`averaged_updates`): 7",
+        "- cameras, looked at after training (`camera_check`): moved by 0.25 pixels, squared errors would fall by 3.1 %",
+        "- machine: two cores",
+    ]  # fmt: skip
+
+
+def test_simulated_effects_and_their_settings_are_told_in_words(tmp_path):
+    effects = {
+        "harmonic_source": {"on": True, "frequencies": 24}, "convection": {"on": True, "body": "surface", "depth_m": 0.1},
+        "thermal_lag": {"on": True, "tau_ms": 12.5}, "radiation": {"on": True}, "own_effect": {"on": True, "order": 2},
+    }  # fmt: skip
+    text = markdown(RunResults(run={"method": "etgs", "scene": "a"}, effects=effects), tmp_path, [], None)
+    told = text[text.index("## Simulated effects") : text.index("## Data")]
+    assert told.split("\n\n")[1].splitlines() == [
+        "- heat source (`harmonic_source`): harmonics 24",
+        "- convection by air (`convection`): body surface, depth 0.1 m",
+        "- lag of the detector (`thermal_lag`): time constant 12.5 ms",
+        "- long-wave radiation (`radiation`): on", "- own effect (`own_effect`): order 2",
+    ]  # fmt: skip

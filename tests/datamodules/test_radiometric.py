@@ -6,14 +6,23 @@ import cv2
 import numpy as np
 import pytest
 from camera_files import PLANCK, dji_jpeg, fff, flir_jpeg, raw_for, temperatures
-from layouts import HEIGHT, WIDTH, names, viewmats, write_colmap, write_image
+from layouts import FOCAL, HEIGHT, WIDTH, names, opengl, viewmats, write_colmap, write_image, write_json
+from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.datamodules.formats.flir import Record
 from heatsplat.datamodules.formats.images import read_image
-from heatsplat.datamodules.formats.radiometric import Calibration, has_temperatures, read_celsius, surface_celsius
+from heatsplat.datamodules.formats.radiometric import (
+    Calibration,
+    has_temperatures,
+    read_celsius,
+    read_thermal,
+    surface_celsius,
+)
+from heatsplat.datamodules.nerfstudio import Nerfstudio
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 FLIR, M3T = DATA / "flir", DATA / "m3t_heath"
@@ -170,3 +179,44 @@ def test_undistorting_real_rjpegs_gives_the_published_undistorted_counts(tmp_pat
     shifted = np.abs(np.roll(celsius, 1, axis=1) - expected)[inside]
     assert np.median(error) < 0.1  # two interpolations of a textured scene
     assert error.mean() < 0.5 * shifted.mean()
+
+
+def float_tiff(path, pixels, says):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tags = ImageFileDirectory_v2()
+    tags[270] = says
+    Image.fromarray(pixels).save(path, tiffinfo=tags)
+
+
+def test_floats_whose_file_says_fahrenheit_are_refused_and_others_are_read(tmp_path):
+    pixels = np.full((4, 5), 70.0, np.float32)
+    float_tiff(tmp_path / "f.tiff", pixels, '{"unit": "F"}')
+    float_tiff(tmp_path / "c.tiff", pixels, '{"unit": "C"}')
+    np.testing.assert_array_equal(read_thermal(tmp_path / "c.tiff"), pixels)
+    said = r"f.tiff says that its numbers are °F, .*counts.scale=0.555556 counts.offset_c=-17.7778 poses=given"
+    with pytest.raises(SceneError, match=said):
+        read_thermal(tmp_path / "f.tiff")
+
+
+@pytest.mark.parametrize("loader", ["colmap", "nerfstudio"])
+def test_a_scene_of_fahrenheit_is_not_trained_as_celsius(tmp_path, loader):
+    files = names(9, "frame_{:03d}.tiff")
+    for i, name in enumerate(files):
+        float_tiff(
+            tmp_path / "images" / name,
+            np.linspace(60, 80 + i, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH),
+            "unit=F",
+        )
+    if loader == "colmap":
+        write_colmap(tmp_path, files, images=None)
+        module = Colmap(root=str(tmp_path))
+    else:
+        frames = [
+            {"thermal_file_path": f"images/{name}", "file_path": f"images/{name}", "transform_matrix": opengl(pose)}
+            for name, pose in zip(files, viewmats(9), strict=True)
+        ]
+        lens = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 20.0, "cy": 16.0, "w": WIDTH, "h": HEIGHT}
+        write_json(tmp_path / "transforms.json", {**lens, "frames": frames})
+        module = Nerfstudio(root=str(tmp_path), random_points=50)
+    with pytest.raises(SceneError, match="says that its numbers are °F"):
+        module.setup()

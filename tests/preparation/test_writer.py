@@ -137,3 +137,29 @@ def test_what_a_stopped_preparation_left_half_written_is_taken_away(tmp_path):
     (tmp_path / "scene" / ".partial" / f"{frames[0].name}.tiff").write_bytes(b"half")  # of other conditions
     assert written(frames, tmp_path / "scene")[1] == [False] * 4
     assert not (tmp_path / "scene" / ".partial").exists()
+
+
+def test_masks_of_pixels_that_are_no_longer_dead_are_taken_away_and_those_of_others_stay(tmp_path):
+    rng = np.random.default_rng(0)
+    images = {f"{i}.tiff": rng.normal(20.0, 0.05, (24, 32)).astype(np.float32) for i in range(4)}
+    for image in images.values():
+        image[5, 7] = 30.0
+    masks = tmp_path / "scene" / "masks"
+
+    def prepared(frames):
+        writer = Writer(tmp_path / "scene", InputUncertainty(), False)
+        writer.find_dead_pixels(frames)
+        records = [writer.write(frame)[0] for frame in frames]
+        writer.write_masks(frames)
+        return [record["dead_pixels"] for record in records]
+
+    assert prepared(read_frames(write_images(tmp_path / "files", images))) == [1] * 4
+    assert len(list(masks.glob("*.png"))) == 4
+    for image in images.values():
+        image[5, 7] = 20.0
+    frames = read_frames(write_images(tmp_path / "files", images))
+    assert prepared(frames) == [0] * 4 and not list(masks.glob("*.png"))
+    own = masks / "0.tiff.png"
+    own.write_bytes(b"drawn by hand")
+    os.utime(frames[0].path, ns=(1, 1))
+    assert prepared(frames) == [0] * 4 and own.read_bytes() == b"drawn by hand"

@@ -135,3 +135,12 @@ def test_knobs_of_the_command_line(tmp_path):
     assert "table.png" in succeeds([str(ROOT / "src/train.py"), "experiment=knobs", *recipe, *asked])
     text = (tmp_path / "table.md").read_text()
     assert all(f"| {name} | 1 |" in text for name in ("default", "init.scale 2 (x0.5)", "init.scale 8 (x2)"))
+
+
+def test_rows_that_change_no_number_are_in_the_table_and_not_in_the_picture(sweep):
+    job(sweep, 5, ["seed=0", "loss=other", "row='another loss'"], 29.0, seconds=10.0)
+    rows = collect(sweep)
+    assert "another loss" in {row.name for row in rows} and factor_of("another loss") is None
+    assert [label.get_text() for label in picture(rows).axes[0].get_yticklabels()] == ["a.b", "n"]
+    Knobs(dict, [2]).write(sweep)
+    assert "| another loss |" in (sweep / "table.md").read_text()

@@ -254,3 +254,11 @@ def test_the_committed_page_names_the_keys_of_the_study():
     page = (ROOT / "docs" / "tuning.md").read_text()
     assert {"trials", "seconds", "search_steps", "check_steps", "seeds", "cases", "methods"} <= keys
     assert all(f"study.{key}" in page for key in ("trials", "seconds", "check_steps", "cases", "methods"))
+
+
+def test_trials_that_fail_spend_seconds_too(world, tmp_path, monkeypatch):
+    clock = iter(range(0, 10_000, 4))
+    monkeypatch.setattr(tune.time, "perf_counter", lambda: next(clock))
+    cases = {"etgs": CASES["etgs"] | {"knobs": {"thermal.lr_source": {"among": [0.95]}}}}
+    tune.run(tmp_path, cases, trials=9, seconds=12)
+    assert [run["seed"] for run in world].count("0") == 1 + 3  # 4 s each

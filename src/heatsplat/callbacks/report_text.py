@@ -12,6 +12,7 @@ from heatsplat.callbacks.attributes import LEARNED_FILE
 from heatsplat.callbacks.courses import COURSES_PICTURE
 from heatsplat.callbacks.metrics import TEST_FILE
 from heatsplat.callbacks.probes import PROBES_PICTURE
+from heatsplat.callbacks.report_words import DATA_WORDS, EFFECT_WORDS, RUN_WORDS, SETTING_WORDS, Words
 from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
 from heatsplat.callbacks.turntable import TURNTABLE_FILE
 from heatsplat.io.citations import citations
@@ -24,36 +25,6 @@ from heatsplat.viewer.page import FILE as VIEWER_FILE
 
 DEFINITIONS_TITLE = "Definitions of the scores"
 
-# What a name of the data is in words, with the unit, where the name itself does not tell (``io.quantities.words_and_unit``).
-DATA_WORDS = {
-    "views": ("images", ""),
-    "image_sizes": ("size of the images in training", "pixels"),
-    "image_size": ("size of the images as stored", "pixels"),
-    "grid": ("size of the images after shrinking", "pixels"),
-    "downscale": ("images are shrunk by", ""),
-    "seconds": ("length of the record", "s"),
-    "points": ("points of the scene", ""),
-    "thermal_range_c": ("temperatures that an image can hold", "°C"),
-    "training_images_c": ("temperatures in the training images", "°C"),
-    "ambient_c": ("temperature of the surroundings", "°C"),
-    "metres_per_unit": ("length of a unit of the scene", "m"),
-    "noise_k": ("noise of the camera", "K"),
-    "bits": ("bits of a pixel", ""),
-    "pose_error_px": ("error of the poses", "pixels"),
-    "effects": ("effects in the scene", ""),
-    "probes": ("points whose temperature is known", ""),
-    "split": ("test images are chosen by", ""),
-    "val_views": ("validation images", ""),
-    "pixel_type": ("numbers in the image files", ""),
-    "channels": ("channels of the image files", ""),
-    "clipped_fraction": ("pixels beyond these temperatures", "%"),
-    "masked_fraction": ("pixels that do not count", "%"),
-    "test_pixels_counted": ("pixels of the test images that count", "%"),
-    "test_pixels_saturated": ("pixels of the test images at the camera's ends", "%"),
-    "utc_at_zero_s": ("time at second 0", ""),
-    "clock_at_zero_s": ("camera's clock at second 0", ""),
-    "prepared_uncertainty_c": ("uncertainty of the temperatures, by preparation", "°C"),
-}
 DATA_VALUES = {
     "uint8": "8-bit integers",
     "uint16": "16-bit integers",
@@ -103,7 +74,7 @@ def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves
     lines += _picture_section("What all surfaces or images share over time", folder, COURSES_PICTURE, "learned courses")
     lines += _surfaces_section(folder)
     lines += learned_section(folder)
-    lines += ["", "## The run", "", *_bullets(run)]
+    lines += ["", "## The run", "", *_told_lines(run, RUN_WORDS)]
     lines += _effects_section(content["effects"])
     lines += ["", "## Data: findings and assumptions", "", *data_lines(content["data"])]
     lines += ["", f"## {DEFINITIONS_TITLE}", "", *_bullets(content["definitions"])]
@@ -194,9 +165,9 @@ def _effects_section(effects: Mapping[str, Any]) -> list[str]:
         simulated = {
             name: {key: value for key, value in effect.items() if key != "on"} for name, effect in effects.items()
         }
-        return ["", "## Simulated effects", "", *(_bullets(simulated) or ["None."])]
+        return ["", "## Simulated effects", "", *(_settings_lines(simulated) or ["None."])]
     settings = {name: effect["settings"] for name, effect in effects.items() if effect.get("settings")}
-    return ["", "## Effects", "", *effects_table(effects), "", EFFECTS_NOTE, "", *_bullets(settings)]
+    return ["", "## Effects", "", *effects_table(effects), "", EFFECTS_NOTE, "", *_settings_lines(settings)]
 
 
 def effects_table(effects: Mapping[str, Any]) -> list[str]:
@@ -214,7 +185,7 @@ def effects_table(effects: Mapping[str, Any]) -> list[str]:
     rows = [_effects_row(name, asked[name]) for name in sorted(asked, key=lambda name: _place(asked[name]))]
     head = ("effect", "simulated", "statistic", "threshold", "dB", "dB per ms", "reason", "parameters", "ms per step")
     table = markdown_table(head, rows, align="llrrrrlrr") if rows else []
-    below = [f"- {', '.join(names)}: no; {reason}" for reason, names in together.items()]
+    below = [f"- {', '.join(map(_effect, names))}: no; {reason}" for reason, names in together.items()]
     return [*table, *([""] if rows and below else []), *below]
 
 
@@ -232,7 +203,7 @@ def _effects_row(name: str, effect: Mapping[str, Any]) -> tuple[str, ...]:
     on = sure if effect["told"] else "yes, but cannot be told" if effect["on"] else "cannot be told"
     gain, cost = effect["gain_db"], effect["ms_per_step"]
     gains = (NONE if gain is None else f"{gain:.1f}", f"{gain / cost:.2g}" if gain and cost and cost > 0 else NONE)
-    return name, on, statistic, threshold, *gains, effect["reason"], parameters, milliseconds
+    return _effect(name), on, statistic, threshold, *gains, effect["reason"], parameters, milliseconds
 
 
 def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:
@@ -254,17 +225,44 @@ def _number(value: float) -> str:
 
 def data_lines(data: Mapping[str, Any]) -> list[str]:
     """A list for Markdown of what metrics.json tells of the data, in words and with units."""
-    shown = (_in_words(name, value) for name, value in data.items() if TWICE.get(name) not in data)
+    shown = (_in_words(name, value, DATA_WORDS) for name, value in data.items() if TWICE.get(name) not in data)
     return [f"- {words}: {told}" for words, told in shown]
 
 
-def _in_words(name: str, value: Any) -> tuple[str, str]:
-    """A name of the data and its value for people, with its unit where it is a number; one level of nesting in line."""
-    words, unit = DATA_WORDS.get(name) or words_and_unit(name)
+def _told_lines(values: Mapping[str, Any], known: Words) -> list[str]:
+    """A list for Markdown of names and values in words, each with its name in metrics.json where that is another."""
+    told = ((name, *_in_words(name, value, known)) for name, value in values.items())
+    return [f"- {_labelled(words, name)}: {value}" for name, words, value in told]
+
+
+def _settings_lines(effects: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """A list for Markdown of effects and their settings, in words."""
+    told = ((name, _in_words(name, settings, SETTING_WORDS)[1]) for name, settings in effects.items())
+    return [f"- {_effect(name)}: {settings}" for name, settings in told]
+
+
+def _effect(name: str) -> str:
+    return _labelled(EFFECT_WORDS.get(name, name.replace("_", " ")), name)
+
+
+def _labelled(words: str, name: str) -> str:
+    """Words with the name that they stand for, by which it can be found or set."""
+    return words if words == name else f"{words} (`{name}`)"
+
+
+def _in_words(name: str, value: Any, known: Words) -> tuple[str, str]:
+    """A name and its value for people, with its unit where it is a number; one level of nesting in line.
+
+    Args:
+        name: in metrics.json.
+        value: as it stands there.
+        known: what names are in words.
+    """
+    words, unit = known.get(name) or words_and_unit(name)
     if isinstance(value, Mapping):
         if name == "views":
             return words, ", ".join(f"{_words(count)} {PARTS.get(part, part)}" for part, count in value.items())
-        return words, ", ".join(" ".join(_in_words(*item)) for item in value.items()) or "on"
+        return words, ", ".join(" ".join(_in_words(*item, known)) for item in value.items()) or "on"
     values = value if isinstance(value, list | tuple) else [value]
     numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
     if name in CLOCKS and numbers:

@@ -129,9 +129,10 @@ def knob(name: str) -> str:
     return name.partition(" ")[0]
 
 
-def factor_of(name: str) -> float:
-    """By what it is multiplied, such as 0.5 of "optim.means 8e-05 (x0.5)"."""
-    return float(name.rpartition("(x")[2].rstrip(")"))
+def factor_of(name: str) -> float | None:
+    """By what it is multiplied, such as 0.5 of "optim.means 8e-05 (x0.5)"; None of a row that changes no number."""
+    found = re.search(r" \(x([\d.e+-]+)\)$", name)
+    return float(found[1]) if found else None
 
 
 # What they are worth -------------------------------------------------------------------------------------------------
@@ -162,9 +163,10 @@ def _by_seed(row: Runs, name: str) -> dict[str, float]:
 def picture(rows: Sequence[Runs]) -> Figure | None:
     """What each knob gains, and beside it what it costs: blue for less of it, red for more, larger for further away.
 
-    The grey band is the spread of the default over its seeds. A pair of panels for each scene, and for each other setting; None
-    where no default has a result.
+    The grey band is the spread of the default over its seeds. A pair of panels for each scene, and for each other setting. Rows
+    that change no number, such as those of another sweep in the same folder, are left out; None where no default has a result.
     """
+    rows = [row for row in rows if row.name == DEFAULT or factor_of(row.name) is not None]
     defaults = [row for row in rows if row.name == DEFAULT and row.mean("psnr") is not None]
     if not defaults:
         return None

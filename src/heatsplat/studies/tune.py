@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import statistics
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -153,7 +154,7 @@ def run(
             A range of whole numbers gives whole numbers; one above 0 is searched by its logarithm.
         methods: which of the cases; None: all.
         trials: settings that are tried for each method, beside its default; at least 1.
-        seconds: of the trials' runs of a method, after which no other begins; None: no limit.
+        seconds: of the trials' runs of a method, failed ones too, after which no other begins; None: no limit.
         search_steps: length of the runs of the search, whose seed is 0.
         check_steps: lengths at which the best is compared with the default.
         seeds: of those comparisons; 0 is the search's.
@@ -271,13 +272,15 @@ def _search(
             log.info("%s: %d of %d trials, %.0f s", runs.method, count, trials, spent)
             return
         asked = study.ask(space)
+        began = time.perf_counter()
         trial = runs.attempt(f"trial{count}", {key: _rounded(value) for key, value in asked.params.items()}, steps)
         value = None if trial.results is None else trial.results.test[score]
         if value is None:
             study.tell(asked, state=optuna.trial.TrialState.FAIL)
         else:
             study.tell(asked, value)
-            spent += trial.results.cost["wall_seconds"] or 0.0
+        # What failed has left no cost; what was there already has one, though it took no time now.
+        spent += time.perf_counter() - began if trial.results is None else trial.results.cost["wall_seconds"] or 0.0
         log.info("%s, %s: %s %s", runs.method, " ".join(_words(trial.settings)), score, number(value, 3))
         yield trial
 
