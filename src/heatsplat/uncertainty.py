@@ -234,9 +234,9 @@ class Uncertainty:
         air temperature, and what an observed surface is that the model's is not.
 
         What neither a Gaussian's numbers nor a doubt change, such as how much of all heat the air lets pass, has none: it is no
-        more certain than what the whole scene has in common, of which this knows nothing. NaN where a Gaussian has no value. Empty
-        for models that tell nothing, and for those of which a Gaussian has more numbers than such a block can hold, or not all
-        the same.
+        more certain than what the whole scene has in common, of which this knows nothing. NaN where a Gaussian has no value.
+        Empty for models that tell nothing, and for those of which a Gaussian has more numbers than such a block can hold, or not
+        all the same.
         """
         module, count = self.module, len(self.module.splats)
         told = module.attributes(frame)
