@@ -235,8 +235,8 @@ class Uncertainty:
 
         What neither a Gaussian's numbers nor a doubt change, such as how much of all heat the air lets pass, has none: it is no
         more certain than what the whole scene has in common, of which this knows nothing. NaN where a Gaussian has no value.
-        Empty for models that tell nothing, and for those of which a Gaussian has more numbers than such a block can hold, or
-        not all the same.
+        Empty for models that tell nothing, and for those of which a Gaussian has more numbers than such a block can hold, or not
+        all the same.
         """
         module, count = self.module, len(self.module.splats)
         told = module.attributes(frame)

@@ -282,6 +282,17 @@ def test_too_little_time_is_refused_with_the_least():
     assert plan(POINTS, "etgs", enough, least, cap_max=100_000).steps >= 100
 
 
+def test_the_least_time_is_not_planned_for_what_takes_more():
+    """What scores best in fewer steps than a run has at least takes more time for these."""
+    cheap = replace(CHEAP[0], growth=1.0, mean_growth=1.0, psnr=20.0, settings=(), cost=1.0)
+    dear = replace(cheap, growth=8.0, mean_growth=8.0, psnr=30.0)
+    points = [replace(one, steps=one.steps * k, psnr=one.psnr + k) for one in (cheap, dear) for k in (1, 2)]
+    pace = Pace(0.001, 1e-5, 1000, 0.0)
+    least = 100 * pace.step_s(1000)
+    found, later = (plan(points, "etgs", pace, asked, cap_max=10**6) for asked in (least, 8 * least))
+    assert (found.growth, found.steps, later.growth) == (1.0, 100, 8.0)
+
+
 def test_what_was_not_measured_is_said():
     other = plan(POINTS, "ravigs", PACE, 30.0, cap_max=100_000)
     assert other.expected_psnr is None and "ravigs has no measured curves; those of etgs stand in" in other.reasons[0]

@@ -235,9 +235,10 @@ class RunCosts:
         return low
 
     def best(self, seconds: float) -> tuple[float, Choice, int]:
-        """Expected PSNR, choice and steps of the best."""
+        """Expected PSNR, choice and steps of the best that has MIN_STEPS; there must be one that has them."""
         steps = {choice: self.affordable(choice, seconds) for choice in self.outlook.choices}
-        return max((self.outlook.psnr(choice, count), choice, round(count)) for choice, count in steps.items())
+        whole = {choice: count for choice, count in steps.items() if round(count) >= MIN_STEPS}
+        return max((self.outlook.psnr(choice, count), choice, round(count)) for choice, count in whole.items())
 
     def cap(self, growth: float) -> int | None:
         """Gaussians at most."""
@@ -289,7 +290,7 @@ def plan(
         asked_s=asked_s,
         calibration_s=round(pace.spent_s, 3),
         train_s=round(train_s, 3),
-        steps=max(steps, MIN_STEPS),
+        steps=steps,
         cap=costs.cap(chosen.growth),
         growth=costs.growth(chosen),
         decay=chosen.decay if free_decay else None,
