@@ -14,7 +14,7 @@ import torch
 from heatsplat.contracts import SceneError, counted, evenly_spread
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.benchmark import Benchmark
-from heatsplat.datamodules.benchmark_folder import META, TRUTH
+from heatsplat.datamodules.benchmark_folder import META, SCENES, TRUTH
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
 from heatsplat.datamodules.formats.radiometric import read_bytes
@@ -122,6 +122,10 @@ def materials_in(
         raise SceneError(f"check={folder}: there is no such folder")
     if (loader := _loader_of(folder, downscale)) is not None:
         return {"": material_of(loader.scene)}, _assumed(loader)
+    if scenes := sorted(path.parent for path in (folder / SCENES).glob(f"*/{META}")):
+        raise SceneError(
+            f"{folder} holds {counted(len(scenes), 'scene')} of the protocol: give one, such as {scenes[0]}"
+        )
     reading = reading or Reading()
     recording = read_recording(folder, reading)
     devices = devices_of(recording.frames)

@@ -173,6 +173,8 @@ def test_a_scene_of_the_protocol_is_read_with_its_bounds_weather_and_test_images
     with caplog.at_level("INFO"):
         check(str(tmp_path / "scenes" / "hall"), tmp_path)
     assert "read as data=benchmark reads it" in caplog.messages
+    with pytest.raises(SceneError, match=r"holds 1 scene of the protocol: give one, such as .*scenes/hall"):
+        check(str(tmp_path), tmp_path)
     shutil.rmtree(tmp_path / "truth")  # which is not handed out
     caplog.clear()
     with caplog.at_level("INFO"):

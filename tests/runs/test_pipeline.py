@@ -15,6 +15,7 @@ from heatsplat.composition import build, run_of
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.runs.checks import checked
+from heatsplat.runs.folder import results_in
 from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import differences, on_scene, resumed
 from heatsplat.training.checkpoints import load_checkpoint
@@ -306,6 +307,11 @@ def test_an_unfinished_run_of_an_older_heatsplat_is_told_with_its_settings_and_w
     with pytest.raises(OccupiedError, match="an older heatsplat, which did not have optim.averaged: ckpt=") as told:
         resumed(config, tmp_path)
     assert f"ckpt={path} hydra.run.dir={tmp_path} goes on from step 8" in str(told.value)
+    shutil.copy(trained[0] / "metrics.json", tmp_path)
+    with pytest.raises(
+        OccupiedError, match="results of an older heatsplat, which did not have optim.averaged: give another"
+    ):
+        results_in(tmp_path, config)
     with pytest.raises(OccupiedError, match=r"with other settings \(optim.averaged\)"):  # that was asked for
         resumed(checked(heatsplat.compose([*QUICK, "optim.averaged=0.2"])), tmp_path)
 

@@ -124,6 +124,6 @@ def test_a_run_without_sunlight_says_what_to_do_under_a_record_that_has_gained_i
         _, trainer = run(tmp_path, *BARE, "method=energy_balance", "max_steps=3")
         trainer.save_checkpoint(tmp_path / "dark.ckpt")
     with pytest.raises(
-        SceneError, match=r"lacks raw_sun: .*has gained or lost its irradiance since\. .*taken out again"
+        SceneError, match=r"lacks normals, raw_sun: .*has gained or lost its irradiance since\. .*taken out again"
     ):
         load(tmp_path / "dark.ckpt")

@@ -15,7 +15,7 @@ def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
     """The results that a run with this configuration left in a folder; None where there are none.
 
     Raises:
-        OccupiedError: they are of a run with other settings, with their names.
+        OccupiedError: they are of a run with other settings, or of a heatsplat that did not have some, with their names.
     """
     if not (folder / METRICS_FILE).exists():
         return None
@@ -24,8 +24,8 @@ def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
     changed = differences(checked(config), stored) if stored else []
     if changed and len(new_in(config, stored, changed)) == len(changed):
         raise OccupiedError(
-            f"{folder} holds the results of an older heatsplat, which did not have {', '.join(changed)}: give another folder with "
-            "hydra.run.dir (of a sweep: hydra.sweep.dir), or delete that one, and it is trained anew"
+            f"{folder} holds the results of an older heatsplat, which did not have {', '.join(changed)}: give another folder "
+            "with hydra.run.dir (of a sweep: hydra.sweep.dir), or delete that one, and it is trained anew"
         )
     if changed:
         raise OccupiedError(
