@@ -13,6 +13,8 @@ import torch
 
 from heatsplat.contracts import SceneError, counted, evenly_spread
 from heatsplat.datamodules.base import SceneDataModule
+from heatsplat.datamodules.benchmark import Benchmark
+from heatsplat.datamodules.benchmark_folder import META, SCENES, TRUTH
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
 from heatsplat.datamodules.formats.radiometric import read_bytes
@@ -120,6 +122,10 @@ def materials_in(
         raise SceneError(f"check={folder}: there is no such folder")
     if (loader := _loader_of(folder, downscale)) is not None:
         return {"": material_of(loader.scene)}, _assumed(loader)
+    if scenes := sorted(path.parent for path in (folder / SCENES).glob(f"*/{META}")):
+        raise SceneError(
+            f"{folder} holds {counted(len(scenes), 'scene')} of the protocol: give one, such as {scenes[0]}"
+        )
     reading = reading or Reading()
     recording = read_recording(folder, reading)
     devices = devices_of(recording.frames)
@@ -149,6 +155,8 @@ def _loader_of(folder: Path, downscale: float) -> SceneDataModule | None:
 
     given = {"root": str(folder), "downscale": downscale}
     model, both = find_model(folder) is not None, has(*FILES.values())
+    if both and has(META, PROTOCOL_POINTS):  # the training images alone where test images are not handed out
+        return Benchmark(**given) if _truth_of(folder).is_dir() else Nerfstudio(split="every_8th", **given)
     if has("meta.json") and (model or both) and not has(PROTOCOL_POINTS):
         return Thermo(**given)
     if find_model(folder / "thermal") is not None or (model and has("info.json")):
@@ -161,6 +169,12 @@ def _loader_of(folder: Path, downscale: float) -> SceneDataModule | None:
         return RGBTScenes(**given)
     usual = {"raw": "raw16", "rgb": "rgb", "time_csv": "times.csv"}
     return Colmap(**given, **{key: name for key, name in usual.items() if has(name)}) if model else None
+
+
+def _truth_of(folder: Path) -> Path:
+    """Where ``Benchmark`` looks for the test images of a scene of the protocol."""
+    folder = folder.absolute()
+    return folder.parent.parent / TRUTH / folder.name
 
 
 def _assumed(loader: SceneDataModule) -> list[str]:

@@ -11,7 +11,9 @@ from PIL import Image
 from recordings import read_frames
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.benchmark_folder import write_scene
 from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene import writers
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, write_camera
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Size, film
@@ -163,3 +165,18 @@ def test_clocks_of_which_one_says_no_zone_may_be_hours_apart(tmp_path):
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     with pytest.raises(SceneError, match="nowhere"):
         check(str(tmp_path / "nowhere"))
+
+
+def test_a_scene_of_the_protocol_is_read_with_its_bounds_weather_and_test_images(tmp_path, caplog):
+    scene = Synthetic(scene="static", size="tiny", split="parts", parts={"near": 8, "views": 0.12, "times": None}).scene
+    write_scene(scene, tmp_path / "scenes" / "hall", tmp_path / "truth" / "hall", {"protocol": 1, "size": "tiny"})
+    with caplog.at_level("INFO"):
+        check(str(tmp_path / "scenes" / "hall"), tmp_path)
+    assert "read as data=benchmark reads it" in caplog.messages
+    with pytest.raises(SceneError, match=r"holds 1 scene of the protocol: give one, such as .*scenes/hall"):
+        check(str(tmp_path), tmp_path)
+    shutil.rmtree(tmp_path / "truth")  # which is not handed out
+    caplog.clear()
+    with caplog.at_level("INFO"):
+        check(str(tmp_path / "scenes" / "hall"), tmp_path)
+    assert "read as data=nerfstudio reads it" in caplog.messages and "4 of 19 frames without" in caplog.text

@@ -6,7 +6,7 @@ import pytest
 import torch
 from running import BARE, run
 
-from heatsplat.contracts import ThermalRange
+from heatsplat.contracts import SceneError, ThermalRange
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.runs.run import load
 from heatsplat.thermal.composed import Composed
@@ -109,3 +109,21 @@ def test_a_run_without_wind_is_looked_at_under_a_record_that_has_gained_it(tmp_p
     assert torch.equal(trained.module.predict(frame), module.predict(frame))
     assert "none in training" in trained.module.thermal.effects()["convection"]["left_out"]
     assert Composed(EnergyBalance(clip="none")).optional == {"raw_wind"}
+
+
+def test_a_run_without_sunlight_says_what_to_do_under_a_record_that_has_gained_it(tmp_path, monkeypatch):
+    film = Synthetic.load
+
+    def dark(self):
+        scene = film(self)
+        without = dict.fromkeys(("sun", "irradiance_w_m2", "direct_w_m2", "diffuse_w_m2"))
+        return replace(scene, weather=replace(scene.weather, **without))
+
+    with monkeypatch.context() as filming:
+        filming.setattr(Synthetic, "load", dark)
+        _, trainer = run(tmp_path, *BARE, "method=energy_balance", "max_steps=3")
+        trainer.save_checkpoint(tmp_path / "dark.ckpt")
+    with pytest.raises(
+        SceneError, match=r"lacks normals, raw_sun: .*has gained or lost its irradiance since\. .*taken out again"
+    ):
+        load(tmp_path / "dark.ckpt")

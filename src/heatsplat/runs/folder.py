@@ -8,19 +8,25 @@ from typing import Any
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.runs.checks import checked
 from heatsplat.runs.lock import OccupiedError
-from heatsplat.runs.resume import checkpoints_in, differences, stored_config
+from heatsplat.runs.resume import checkpoints_in, differences, new_in, stored_config
 
 
 def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
     """The results that a run with this configuration left in a folder; None where there are none.
 
     Raises:
-        OccupiedError: they are of a run with other settings, with their names.
+        OccupiedError: they are of a run with other settings, or of a heatsplat that did not have some, with their names.
     """
     if not (folder / METRICS_FILE).exists():
         return None
     _, newest = next(checkpoints_in(folder), (None, {}))
-    changed = differences(checked(config), stored_config(newest)) if stored_config(newest) else []
+    stored = stored_config(newest)
+    changed = differences(checked(config), stored) if stored else []
+    if changed and len(new_in(config, stored, changed)) == len(changed):
+        raise OccupiedError(
+            f"{folder} holds the results of an older heatsplat, which did not have {', '.join(changed)}: give another folder "
+            "with hydra.run.dir (of a sweep: hydra.sweep.dir), or delete that one, and it is trained anew"
+        )
     if changed:
         raise OccupiedError(
             f"{folder} holds the results of a run with other settings ({', '.join(changed)}): give another folder with "

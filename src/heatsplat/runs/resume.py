@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -143,9 +143,16 @@ def _check_own(config: dict[str, Any], output_dir: Path, path: Path, checkpoint:
     """Raises OccupiedError where a checkpoint in a run's folder is of other settings."""
     if changed := differences(config, stored_config(checkpoint)):
         more = f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else ""
+        step = checkpoint.get("global_step")
+        if len(new_in(config, stored_config(checkpoint), changed)) == len(changed):
+            raise OccupiedError(
+                f"{output_dir} holds an unfinished run of an older heatsplat, which did not have "
+                f"{', '.join(changed[:SHOWN])}{more}: ckpt={path} hydra.run.dir={output_dir} goes on from step {step}, and they "
+                "count from there on; or delete that folder (of a sweep: that of the job), and the same command trains it anew"
+            )
         raise OccupiedError(
             f"{output_dir} holds an unfinished run with other settings ({', '.join(changed[:SHOWN])}{more}), of which "
-            f"{path.name} is of step {checkpoint.get('global_step')}: give another folder with hydra.run.dir; or go on with that "
+            f"{path.name} is of step {step}: give another folder with hydra.run.dir; or go on with that "
             f"run, with its settings and ckpt={path}; or delete that folder"
         )
 
@@ -193,10 +200,7 @@ def _check_same_settings(config: dict[str, Any], stored: Mapping[str, Any]) -> N
         shorter = compose([*overrides, f"max_steps={before['max_steps']}"])
         config = followed(config, compose(overrides), shorter)
     changed = [key for key in differences(config, stored) if not f"{key}.".startswith(OPEN)]
-    given = keys_of(overrides)
-    new = [
-        key for key in changed if at(before, key, ABSENT) is ABSENT and not any(overlap(key, other) for other in given)
-    ]
+    new = new_in(config, stored, changed)
     if known := [key for key in changed if key not in new]:
         raise SceneError(
             f"{config['ckpt']} was trained with another {', '.join(known)}: give what it was trained with, or start anew without "
@@ -204,6 +208,12 @@ def _check_same_settings(config: dict[str, Any], stored: Mapping[str, Any]) -> N
         )
     if new:
         log.warning("%s is of an older heatsplat without %s: they count from here on", config["ckpt"], ", ".join(new))
+
+
+def new_in(config: Mapping[str, Any], stored: Mapping[str, Any], changed: Iterable[str]) -> list[str]:
+    """Those of the settings that an older heatsplat did not have when it wrote ``stored``, and that were not asked for."""
+    before, given = {**stored, **stored.get("composed", {})}, keys_of(config["overrides"])
+    return [key for key in changed if at(before, key, ABSENT) is ABSENT and not any(overlap(key, one) for one in given)]
 
 
 def _check_steps_left(config: Mapping[str, Any], checkpoint: Mapping[str, Any]) -> None:

@@ -484,14 +484,25 @@ class SplatTraining(SceneModel):
 
 
 def check_same_method(module: SplatTraining, checkpoint: dict[str, Any]) -> None:
-    """Raises SceneError when a checkpoint was written by another method than ``module`` trains."""
+    """Raises SceneError when a checkpoint was written by another method, or on data that told other things."""
     if CHECKPOINT_KEY not in checkpoint:
         raise SceneError("the checkpoint was not written by heatsplat: it holds no 'heatsplat' entry")
     stored = checkpoint[CHECKPOINT_KEY]["config"].get("name")
     here = module.config.get("name")
     names = {f"splats.raw.{name}" for name in module.splats.names}
     found = {name for name in checkpoint["state_dict"] if name.startswith("splats.raw.")}
-    if stored != here or names != found:
+    if stored == here and names != found:
+        told = (
+            f"{what} {', '.join(sorted(name.removeprefix('splats.raw.') for name in some))}"
+            for what, some in (("lacks", names - found), ("has beyond this run", found - names))
+            if some
+        )
+        raise SceneError(
+            f"the checkpoint of method '{stored}' {' and '.join(told)}: it was trained with other settings, or on data that told "
+            "other things, such as a weather record that has gained or lost its irradiance since. Give the settings and the data "
+            "that it was trained with (columns that are new in a table taken out again), or start without ckpt."
+        )
+    if stored != here:
         difference = ", ".join(sorted(name.removeprefix("splats.raw.") for name in names ^ found)) or "none"
         raise SceneError(
             f"the checkpoint is of method '{stored}', this run is method '{here}' (tensors that differ: {difference}). "
