@@ -220,6 +220,18 @@ def test_without_the_suns_direction_all_surfaces_lie_level_and_it_says_so():
     assert "no irradiance" in str(model.effects())
 
 
+def test_a_weather_that_tells_of_the_sun_what_training_did_not_is_refused_with_what_to_leave_out():
+    dark = weather(sun=None, direct_w_m2=None, diffuse_w_m2=None, irradiance_w_m2=None)
+    level = weather(sun=None, direct_w_m2=None, diffuse_w_m2=None)
+    for trained, word in ((dark, "light"), (level, "direction")):
+        model, splats = ready(scene(trained))
+        model.under(weather())
+        with pytest.raises(
+            SceneError, match=f"tells the sun's {word}, of which there was none in training: leave its columns"
+        ):
+            model.temperature(splats, 12 * HOUR)
+
+
 def test_another_weather_changes_the_answer_without_training():
     model, splats = ready()
     with torch.no_grad():

@@ -406,6 +406,12 @@ class EnergyBalance(ThermalModel):
             return Core(state("initial_core"), query.rows(splats["log_core_rate"]).clamp(*LOG_RATES), coupling)
 
         drivers = self.climate.drivers
+        for needed, name, what in ((self._sunlit, "raw_sun", "light"), (drivers.up is not None, NORMALS, "direction")):
+            if needed and name not in splats:
+                raise SceneError(
+                    f"this weather tells the sun's {what}, of which there was none in training: leave its columns of sunlight "
+                    "out, or train with it"
+                )
         log_rate = query.rows(splats["log_rate"]).clamp(*LOG_RATES)
         if not self._exchange_given:
             share = bounded("raw_share", *SHARE_LIMITS) if drivers.sky is not None else None
