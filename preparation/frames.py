@@ -190,7 +190,8 @@ def _greys_in_colour(kinds: dict[str, list[Path]], folder: Path) -> dict[str, li
     if colour:
         raise SceneError(
             f"{folder} holds coloured pictures alone (such as {colour[0].name}): colours of a palette are no temperatures. "
-            "Export radiometric files, 16-bit counts, temperatures as TIFF, or greys with known bounds"
+            "Export radiometric files, 16-bit counts, temperatures as TIFF, or greys with known bounds. Photos are not prepared: "
+            "with a COLMAP model beside their folder they train by data=colmap data.images=null data.rgb=FOLDER"
         )
     return kinds
 

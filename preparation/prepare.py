@@ -134,8 +134,9 @@ def _cameras(
         found = poses(frames, target)
     except SceneError as error:
         report.write_report(target, [*before, Section("Poses", [f"**{error}.**"])])
+        what = "images" if all(frame.calibration is None for frame in frames) else "temperatures"  # greys have none
         raise SceneError(
-            f"{error}. The temperatures are in {target / 'images'} all the same (poses=none leaves out the search)"
+            f"{error}. The {what} are in {target / 'images'} all the same (poses=none leaves out the search)"
         ) from error
     finally:
         place.has_cameras()

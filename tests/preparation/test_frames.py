@@ -130,7 +130,10 @@ def test_folders_that_cannot_be_understood_are_refused_by_name(tmp_path):
         read_frames(write_images(tmp_path / "empty", {}))
     y, x = np.mgrid[:16, :16].astype(np.uint8)
     palette = cv2.applyColorMap((y * 16 + x), cv2.COLORMAP_INFERNO)
-    with pytest.raises(SceneError, match="coloured pictures alone .such as a.png.: colours of a palette"):
+    with pytest.raises(
+        SceneError,
+        match="coloured pictures alone .such as a.png.: colours of a palette.*Photos .*data.images=null data.rgb=FOLDER",
+    ):
         read_frames(write_images(tmp_path / "colours", {"a.png": palette}))
     with pytest.raises(SceneError, match="several kinds.*floating-point images .*16-bit images .*folder of its own"):
         read_frames(write_images(tmp_path / "mixed", {"a.tiff": FLOATS, "b.png": (FLOATS * 100).astype(np.uint16)}))

@@ -177,3 +177,10 @@ def test_settings_that_change_nothing_are_refused(tmp_path):
     with pytest.raises(SceneError, match="conditions.reflected_c=5 changes nothing while emissivity is 1"):
         prepare(str(source), tmp_path / "scene", **{**PLAIN, "conditions": {"reflected_c": 5}})
     assert not (tmp_path / "scene").exists()
+
+
+def test_a_grey_without_temperatures_and_cameras_is_not_said_to_be_temperatures(tmp_path):
+    source = write_images(tmp_path / "files", {"a.png": np.arange(48, dtype=np.uint8).reshape(6, 8)})
+    with pytest.raises(SceneError, match=r"1 frame cannot tell .*\. The images are in .*scene/images all the same"):
+        prepare(str(source), tmp_path / "scene", **PLAIN, poses=FindPoses(Sift(most=200)))
+    assert (tmp_path / "scene" / "images" / "a.png").is_file()
