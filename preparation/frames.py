@@ -26,8 +26,8 @@ from heatsplat.datamodules.formats.images import (
     to_grey,
 )
 from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
+from heatsplat.datamodules.formats.temperature_table import MIN_SIDE, read_temperature_table
 from heatsplat.datamodules.formats.temperature_table import SUFFIX as TABLE
-from heatsplat.datamodules.formats.temperature_table import read_temperature_table
 from heatsplat.datamodules.timestamps import dji_time, instant, zone_of
 from heatsplat.io.files import by_numbers
 from heatsplat.preparation.devices import devices_of, listed
@@ -102,7 +102,7 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         raise SceneError(f"source={folder} is no folder")
     kinds: dict[str, list[Path]] = {}
     greys_known = reading.meaning.of_greys(folder)[0] is not None
-    found = (p for p in folder.rglob("*") if p.suffix.lower() in (*SUFFIXES, *RECORDS, TABLE) and p.is_file())
+    found = [p for p in folder.rglob("*") if p.suffix.lower() in (*SUFFIXES, *RECORDS, TABLE) and p.is_file()]
     for path in sorted(found, key=lambda p: by_numbers(p.relative_to(folder).as_posix())):
         kind = _kind(path)
         if kind is None:
@@ -126,7 +126,7 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     if not there:
         raise SceneError(
             f"{folder} holds no thermal image: radiometric JPEG of FLIR or DJI, .fff, .seq, .csq, TIFF or PNG with counts or °C, "
-            "tables of °C (.csv), or greys"
+            f"tables of °C (.csv), or greys{_no_tables(sorted(found))}"
         )
     kind, thermal = there[0], kinds[there[0]]
     reading.meaning.check_use(kind, KINDS[kind])
@@ -146,6 +146,15 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
             "names (table=... adds times)"
         )
     return Recording(frames, notes)
+
+
+def _no_tables(found: Iterable[Path]) -> str:
+    """What is said of text files of which none is the table of an image; empty where there are none."""
+    tables = [path for path in found if path.suffix.lower() == TABLE]
+    if not tables:
+        return ""
+    what = "is no table of pixels" if tables[0].read_bytes().strip() else "is empty, export it again"
+    return f". None of its .csv has {MIN_SIDE} rows of {MIN_SIDE} numbers or more: {tables[0].name} {what}"
 
 
 def _kind(path: Path) -> str | None:

@@ -128,6 +128,10 @@ def test_folders_that_cannot_be_understood_are_refused_by_name(tmp_path):
         read_frames(tmp_path / "nothing")
     with pytest.raises(SceneError, match="holds no thermal image"):
         read_frames(write_images(tmp_path / "empty", {}))
+    for text, what in (("", "is empty, export it again"), ("a,b\n1,2\n", "is no table of pixels")):
+        (tmp_path / "empty" / "b.csv").write_text(text)
+        with pytest.raises(SceneError, match=f"None of its .csv has 16 rows of 16 numbers or more: b.csv {what}"):
+            read_frames(tmp_path / "empty")
     y, x = np.mgrid[:16, :16].astype(np.uint8)
     palette = cv2.applyColorMap((y * 16 + x), cv2.COLORMAP_INFERNO)
     with pytest.raises(
