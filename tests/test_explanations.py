@@ -31,6 +31,14 @@ def test_a_list_is_told_its_quotes(wrong, meant):
     assert _quoted("a=[x,[y=1]]") == _quoted("a=['b=c',d=e]") == ""
 
 
+@pytest.mark.parametrize("steps", ["many", "null"])
+def test_steps_that_are_no_number_are_told_without_who_asked_for_them(steps):
+    with pytest.raises(ValueError, match="max_steps") as refused:
+        composition.compose([f"max_steps={steps}"])
+    told = f"max_steps must be a whole number, 1 or more, got {'None' if steps == 'null' else steps}"
+    assert explain(refused.value, "train", []) == sentence(refused.value) == told
+
+
 @pytest.mark.parametrize("typed", ["lr_source", "lr_sorce"])
 def test_a_key_with_dots_in_its_name_is_told_as_it_can_be_typed(typed):
     wrong = ["study=tune", f"study.cases.etgs.knobs.thermal.{typed}=[0.1,1]"]

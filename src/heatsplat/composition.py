@@ -204,19 +204,31 @@ def scene_name(data: str, root: str | None, scene: str | None) -> str:
     return short_name(plain, LONGEST_SCENE)
 
 
+def _length(config: DictConfig) -> int:
+    """Steps of the run.
+
+    Raises:
+        ValueError: ``max_steps`` is no number.
+    """
+    try:
+        return int(config.max_steps)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"max_steps must be a whole number, 1 or more, got {config.max_steps}") from error
+
+
 def _steps(fraction: float, minimum: int = 1, *, _root_: DictConfig) -> int:
     """A fraction of max_steps as a whole number of steps, at least ``minimum``."""
-    return max(int(minimum), round(float(fraction) * int(_root_.max_steps)))
+    return max(int(minimum), round(float(fraction) * _length(_root_)))
 
 
 def _rate(travel: float, least: float, most: float, *, _root_: DictConfig) -> float:
     """A learning rate that covers ``travel`` within the run, within bounds: Adam moves a number by up to one rate a step."""
-    return min(max(float(least), float(travel) / int(_root_.max_steps)), float(most))
+    return min(max(float(least), float(travel) / _length(_root_)), float(most))
 
 
 def _by_length(per_step: float, least: float, most: float, *, _root_: DictConfig) -> float:
     """What grows with the length of the run, within bounds."""
-    return min(max(float(least), float(per_step) * int(_root_.max_steps)), float(most))
+    return min(max(float(least), float(per_step) * _length(_root_)), float(most))
 
 
 def _cores_of(asked: int | None) -> int | None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from hydra.errors import CompactHydraException, InstantiationException, OverrideParseException
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
 from heatsplat.composition import CONF, compose_unresolved, options_of
 from heatsplat.errors import SceneError
@@ -25,6 +25,8 @@ NO_PLACE |= dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), "nothing may
 NO_PLACE |= dict.fromkeys(
     (errno.EEXIST, errno.ENOTDIR), "a file is where a folder is to be: remove it, or give another folder"
 )
+# What OmegaConf says of a resolver of ours that does not take a setting; the key that it names is that of who asked.
+RESOLVED = r"ValueError raised while resolving interpolation: (max_steps must be .*)"
 # What a command takes where someone typed folders alone.
 FOLDERS = {"prepare": "source=FOLDER target=FOLDER"}
 
@@ -63,7 +65,7 @@ def expected(error: BaseException) -> BaseException | None:
 
 def sentence(error: BaseException) -> str:
     """What is printed of an error that is the user's to mend: what it says, without the name of its class."""
-    if told := _of_building(error):
+    if told := _of_building(error) or _of_resolving(error):
         return told
     if not isinstance(error, OSError) or error.strerror is None:
         return str(error) or type(error).__name__
@@ -74,7 +76,7 @@ def sentence(error: BaseException) -> str:
 
 def _of_composing(error: Exception, command: str, arguments: Sequence[str]) -> str | None:
     """What is printed of an error of Hydra, and of what it built; None for a mistake of ours."""
-    if told := _of_building(error):
+    if told := _of_building(error) or _of_resolving(error):
         return told
     cause = error.__cause__
     if _place(error) and cause is not None and _raised_here(cause) and expected(cause) is None:
@@ -93,6 +95,12 @@ def _of_building(error: BaseException) -> str | None:
     if place and isinstance(cause, TypeError) and _of_settings(cause):
         return f"{place}: {cause} (HYDRA_FULL_ERROR=1 shows where)"
     return None
+
+
+def _of_resolving(error: BaseException) -> str | None:
+    """What is printed where a setting is not what others are computed from; None for other errors."""
+    told = re.match(RESOLVED, str(error)) if isinstance(error, InterpolationResolutionError) else None
+    return told and told[1]
 
 
 def _place(error: BaseException) -> str | None:
