@@ -58,6 +58,8 @@ class Writer:
         self.images = target / "images"
         # By name of a frame: [H, W] bool, pixels of its detector that say nothing.
         self.dead: dict[str, np.ndarray] = {}
+        # By name of a frame: masks in the folder that no preparation made, greys.
+        self.drawn: dict[str, np.ndarray] = {}
 
     def check(self, frames: Sequence[ThermalFrame]) -> None:
         """Raises SceneError where the folder holds images of another recording, or there are no counts to keep."""
@@ -82,6 +84,9 @@ class Writer:
         """The record of a frame, and whether its image had to be written."""
         record_file, made_of = self.images / f"{frame.name}.json", self._made_of(frame)
         done = read_json_object(record_file) or {}
+        mask = cv2.imread(str(self._mask_of(image_name(frame))), cv2.IMREAD_GRAYSCALE)
+        if mask is not None and np.count_nonzero(mask == 0) != done.get("dead_pixels", 0):
+            self.drawn[frame.name] = mask
         if done.get("made_of") == made_of and self.image_of(frame).exists():
             return done, False
         stored = frame.load()
@@ -101,9 +106,8 @@ class Writer:
             # Greys that have become temperatures, or the other way round: two images of one name would be taken for each other.
             (self.images / before).unlink(missing_ok=True)
             self._mask_of(before).unlink(missing_ok=True)
-        if (
-            done.get("dead_pixels") and frame.name not in self.dead
-        ):  # the mask is ours, and sound pixels would be left out
+        if done.get("dead_pixels") and frame.name not in self.dead and frame.name not in self.drawn:
+            # A mask of ours, which would leave out pixels that are sound again.
             self._mask_of(image_name(frame)).unlink(missing_ok=True)
         record = self._record(frame, pixels) | {"made_of": made_of}
         write_atomically(record_file, json.dumps(record, indent=1, allow_nan=False) + "\n")
@@ -172,11 +176,13 @@ class Writer:
         return count
 
     def write_masks(self, frames: Sequence[ThermalFrame]) -> None:
-        """Leaves dead pixels out of every image: masks/ (white counts)."""
+        """Leaves dead pixels out of every image: masks/ (white counts). Masks that were drawn leave out what they did, too."""
         for frame in frames:
             if frame.name in self.dead:
-                mask = cv2.imencode(".png", np.where(self.dead[frame.name], 0, 255).astype(np.uint8))[1]
-                self._replace(self._mask_of(image_name(frame)), mask)
+                mask = np.where(self.dead[frame.name], 0, 255).astype(np.uint8)
+                drawn = self.drawn.get(frame.name, mask)
+                if drawn.shape == mask.shape:
+                    self._replace(self._mask_of(image_name(frame)), cv2.imencode(".png", np.minimum(mask, drawn))[1])
 
     def _mask_of(self, image: str) -> Path:
         return self.target / "masks" / f"{image}.png"

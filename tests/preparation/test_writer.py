@@ -163,3 +163,36 @@ def test_masks_of_pixels_that_are_no_longer_dead_are_taken_away_and_those_of_oth
     own.write_bytes(b"drawn by hand")
     os.utime(frames[0].path, ns=(1, 1))
     assert prepared(frames) == [0] * 4 and own.read_bytes() == b"drawn by hand"
+
+
+def test_masks_that_were_drawn_leave_out_what_they_did_beside_dead_pixels(tmp_path):
+    rng = np.random.default_rng(0)
+    images = {f"{i}.tiff": rng.normal(20.0, 0.05, (24, 32)).astype(np.float32) for i in range(4)}
+    target = tmp_path / "scene"
+    masks = target / "masks"
+
+    def prepared() -> None:
+        frames = read_frames(write_images(tmp_path / "files", images))
+        writer = Writer(target, InputUncertainty(), False)
+        writer.find_dead_pixels(frames)
+        for frame in frames:
+            writer.write(frame)
+        writer.write_masks(frames)
+
+    def left_out(name: str) -> list[list[int]]:
+        return np.argwhere(cv2.imread(str(masks / name), cv2.IMREAD_GRAYSCALE) == 0).tolist()
+
+    prepared()
+    masks.mkdir()
+    drawn = np.full((24, 32), 255, np.uint8)
+    drawn[0, :2] = 0
+    cv2.imwrite(str(masks / "0.tiff.png"), drawn)
+    for image in images.values():
+        image[5, 7] = 30.0
+    for _ in range(2):
+        prepared()
+        assert left_out("0.tiff.png") == [[0, 0], [0, 1], [5, 7]] and left_out("1.tiff.png") == [[5, 7]]
+    for image in images.values():
+        image[5, 7] = 20.0
+    prepared()
+    assert [path.name for path in masks.glob("*.png")] == ["0.tiff.png"]
