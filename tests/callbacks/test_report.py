@@ -151,7 +151,8 @@ def test_report_is_whole(run):
     test = RunResults.read(folder / "metrics.json").test
     assert f"| psnr | {test['psnr']:.4g} dB |" in text
     assert "| lpips | – |" in text and "`test.lpips`: LPIPS(alex) needs" in text
-    assert "timestamps: from file names" in text and "newton_cooling: ambient learned" in text
+    assert "timestamps: from file names" in text
+    assert "newton cooling (`newton_cooling`): temperature of the surroundings learned" in text
     assert text.startswith("# etgs on wall")
 
 

@@ -84,10 +84,12 @@ def test_a_run_simulates_what_the_scene_calls_for_and_says_why_and_for_how_much(
     }
     assert all(isinstance(effects[name]["ms_per_step"], float) for name in PRESENT)
     text = (tmp_path / "report.md").read_text()
-    assert "| frame_offset | **yes** | 4 | 1 | – | – | as known | 16 |" in text.replace(
+    assert "| offset of each image (`frame_offset`) | **yes** | 4 | 1 | – | – | as known | 16 |" in text.replace(
         f"| {len(module.scene.train)} |", "| 16 |"
     )
-    assert "fastest of each" in text and "| agc | no | 0.1 | 1 | – | – | as known | 0 | 0 |" in text
+    assert (
+        "fastest of each" in text and "| gain of each image (`agc`) | no | 0.1 | 1 | – | – | as known | 0 | 0 |" in text
+    )
 
 
 def test_a_checkpoint_is_enough_without_looking_at_the_scene_again(scene_says, tmp_path):

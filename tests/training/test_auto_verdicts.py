@@ -4,6 +4,7 @@ import pytest
 from running import TINY, run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from heatsplat.callbacks.report_words import EFFECT_WORDS
 from heatsplat.effects import assembly
 from heatsplat.io.results import RunResults
 
@@ -59,8 +60,9 @@ def test_the_table_is_in_tensorboard_from_the_start_and_in_the_report(drifting):
     (weather,) = (line for line in table.splitlines() if line.endswith(": no; the scene lacks weather, which it needs"))
     assert weather in report
     together = weather.removeprefix("- ").partition(":")[0].split(", ")
-    assert {"solar", "radiation", "convection"} <= set(together)
+    labels = {name: f"{EFFECT_WORDS[name]} (`{name}`)" for name in results.effects}
+    assert {labels[name] for name in ("solar", "radiation", "convection")} <= set(together)
     for name, effect in results.effects.items():
-        row = f"| {name} | {'**yes**' if effect['on'] else 'no' if effect['told'] else 'cannot be told'} |"
-        assert name in together or (row in table and row in report)
+        row = f"| {labels[name]} | {'**yes**' if effect['on'] else 'no' if effect['told'] else 'cannot be told'} |"
+        assert labels[name] in together or (row in table and row in report)
         assert effect["reason"].replace("|", "/") in table
