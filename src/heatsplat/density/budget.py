@@ -259,9 +259,8 @@ class Budget(DensityControl):
     def _scored(self, state: dict[str, Tensor]) -> Tensor:
         """Scores of the Gaussians [N], float64, 0 for those that are not to be split."""
         score = torch.ones_like(state["shown"], dtype=torch.float64)
-        if self.score == "absgrad" or (
-            self._of_pull and state["pull"].any()
-        ):  # centres that are held still have no pull
+        held_still = self.score == "both" and not state["pull"].any()  # no pixel pulls at centres then
+        if self._of_pull and not held_still:
             score *= state["pull"]
         if self._of_pixels:
             score *= state["worth"]
