@@ -1,8 +1,10 @@
-"""Mip-Splatting's two filters at work: an image from farther away is the average of the one nearby; bad eps2d is refused."""
+"""Mip-Splatting's two filters at work: an image from farther away is the average of the one nearby; a pixel averages over its
+area; bad eps2d is refused."""
 
 import pytest
 import torch
 
+from heatsplat.composition import compose
 from heatsplat.contracts import Camera
 from heatsplat.geometry.smoothing import sampling_intervals, smoothed
 from heatsplat.renderers import rasterization
@@ -41,6 +43,27 @@ def test_a_coarser_image_is_the_average_of_the_fine_one():
     assert brighter[False] > 5  # 0.3 pixels² of the coarse image are sixteen times as much space
     assert 0.95 < brighter[True] < 1.05
     assert errors[True] < 0.02 * errors[False]
+
+
+def test_pixels_of_the_default_average_over_their_area():
+    """Against the mean of 8 x 8 samples in each pixel, of surfaces a fifth to three pixels wide that cover one another."""
+    generator = torch.Generator().manual_seed(7)
+    means, quats, scales, opacities = sparks(600)
+    scales = 0.005 * 15 ** torch.rand(scales.shape, generator=generator)
+    values, camera = torch.rand(len(means), 1, generator=generator), near()
+
+    def image(camera: Camera, **settings) -> torch.Tensor:
+        renderer = Renderer("reference", **settings)
+        return renderer(means, quats, scales, opacities, values, camera, None, (1,)).features[..., 0]
+
+    sampled = image(camera.resized(8 * camera.width, 8 * camera.height), antialiased=True, eps2d=1e-4)
+    wanted = sampled.view(camera.height, 8, camera.width, 8).mean((1, 3))
+    errors = {}
+    for name, overrides in {"ours": [], "3dgs": ["recipe=published"], "mip": ["method=mip_splatting"]}.items():
+        settings = compose(["method=3dgs", *overrides])["renderer"]
+        found = image(camera, antialiased=settings["antialiased"], eps2d=settings["eps2d"])
+        errors[name] = (found - wanted).square().mean().sqrt().item()
+    assert errors["ours"] < 0.98 * errors["mip"] and errors["ours"] < 0.3 * errors["3dgs"], errors
 
 
 def test_a_finer_image_does_not_lose_what_the_fine_one_shows():

@@ -73,7 +73,7 @@ def test_without_the_filter_there_is_no_tensor_of_it(tmp_path):
     scales, opacities = module.splats.scales, module.splats.opacities
     same = module.smoothing(scales, opacities)
     assert same[0] is scales and same[1] is opacities
-    assert module.renderer.eps2d == 0.3 and not module.renderer.antialiased
+    assert module.renderer.eps2d == pytest.approx(1 / 12) and module.renderer.antialiased  # of every method
 
 
 def test_a_scene_nearer_than_the_filter_looks_is_told(tmp_path):

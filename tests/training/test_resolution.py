@@ -302,9 +302,9 @@ def test_screen_gradients_of_soft_scenes_are_the_same_at_half_size():
     assert (found[1] - found[0]).norm() < 0.1 * found[0].norm()
 
 
-def small_gaussians(method, pixels):
+def small_gaussians(method, pixels, *overrides):
     """A module on the tiny scene whose Gaussians are about so many pixels wide, and a frame."""
-    module = build(compose([*TINY, f"method={method}", "init.count=400"])["module"])
+    module = build(compose([*TINY, f"method={method}", "init.count=400", *overrides])["module"])
     module.attach(build(compose([*TINY])["data"]).scene)
     frame = module.scene.train.frames[0]
     depth = frame.camera.project(module.splats.means.detach())[1].median()
@@ -315,7 +315,7 @@ def small_gaussians(method, pixels):
 
 @torch.no_grad()
 def test_gaussians_are_as_thick_in_coarse_images_as_in_fine_ones():
-    module, frame = small_gaussians("3dgs", pixels=0.05)  # all blur
+    module, frame = small_gaussians("3dgs", 0.05, "renderer.antialiased=false", "renderer.eps2d=0.3")  # all blur
     small = replace(frame, camera=rendered(frame.camera, 0.5))
     full, scaled, thick = (
         seen.alpha.mean().item() for seen in (module.render(frame), module.render(small, ratio=2), module.render(small))
