@@ -63,6 +63,19 @@ def test_floats_whose_file_says_fahrenheit_are_asked_about(tmp_path):
     assert Meaning(offset_c=0.0).of_floats(pixels, tmp_path / "a.tiff")[1].startswith("floats: °C = 1 * value")
 
 
+def test_floats_whose_file_says_kelvin_are_asked_about_however_hot(tmp_path):
+    pixels, tags = np.full((4, 5), 1100.0, np.float32), ImageFileDirectory_v2()
+    tags[270] = "unit: K"
+    Image.fromarray(pixels).save(tmp_path / "a.tiff", tiffinfo=tags)
+    with pytest.raises(
+        SceneError, match="a.tiff says .* kelvin: give counts.offset_c=-273.15, or counts.offset_c=0 where"
+    ):
+        Meaning().of_floats(pixels, tmp_path / "a.tiff")
+    assert celsius(Meaning(offset_c=-273.15).of_floats(pixels, tmp_path / "a.tiff")[0], [1100.0]) == pytest.approx(
+        [826.85]
+    )
+
+
 def test_greys_have_temperatures_where_there_are_bounds(tmp_path):
     assert Meaning().of_greys(tmp_path)[0] is None
     assert celsius(Meaning(bounds_c=[10, 40]).of_greys(tmp_path)[0], [0.0, 255.0]) == pytest.approx([10.0, 40.0])
