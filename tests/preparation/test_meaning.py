@@ -85,13 +85,21 @@ def test_greys_have_temperatures_where_there_are_bounds(tmp_path):
     assert celsius(found, [100.0]) == pytest.approx([20.0]) and "temperature_bounds.json" in note
 
 
-@pytest.mark.parametrize("unit", ["F", "degF", "Fahrenheit"])
-def test_bounds_in_fahrenheit_are_refused(tmp_path, unit):
+@pytest.mark.parametrize(
+    ("unit", "instead"),
+    [
+        ("F", r"\(F - 32\)"),
+        ("degF", r"\(F - 32\)"),
+        ("Fahrenheit", r"\(F - 32\)"),
+        ("K", "K - 273.15"),
+        ("kelvin", "K - 273.15"),
+    ],
+)
+def test_bounds_in_another_unit_are_refused(tmp_path, unit, instead):
     bounds = {"absolute_min_temperature": 32, "absolute_max_temperature": 212, "Unit": unit}
     (tmp_path / "temperature_bounds.json").write_text(json.dumps(bounds))
-    with pytest.raises(
-        SceneError, match=rf"bounds.json: 'Unit' is '{unit}', and temperatures are read in °C: write \(F - 32\)"
-    ):
+    said = rf"bounds.json: 'Unit' is '{unit}', and temperatures are read in °C: write {instead}"
+    with pytest.raises(SceneError, match=said):
         Meaning().of_greys(tmp_path)
     (tmp_path / "temperature_bounds.json").write_text(json.dumps(bounds | {"Unit": "C"}))
     assert "32 .. 212 °C" in Meaning().of_greys(tmp_path)[1]
