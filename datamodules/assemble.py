@@ -31,7 +31,6 @@ from heatsplat.contracts import (
 )
 from heatsplat.datamodules.bounds import BOUNDS_FILE, MIN_CELSIUS, celsius
 from heatsplat.datamodules.formats.images import PSEUDO_COLOUR_LEVELS
-from heatsplat.datamodules.formats.radiometric import CELSIUS_OF_KELVIN
 from heatsplat.datamodules.poses import MAX_COORDINATE
 from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, image_notes, prepare
 from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
@@ -40,7 +39,6 @@ from heatsplat.datamodules.splits import SplitRule
 from heatsplat.datamodules.weather import weather_at_frame
 from heatsplat.datamodules.weather_table import FIRST_EPOCH_S
 from heatsplat.physics.defects import dead_pixels
-from heatsplat.physics.units import KELVIN_AT_0_C, MAYBE_KELVIN
 
 log = logging.getLogger(__name__)
 
@@ -256,29 +254,10 @@ def _with_temperatures(raw: RawScene, train: Sequence[PreparedImage], notes: dic
     if train[0].found["type"] == "float32" and counts is None:
         counts = CELSIUS
         notes["encoding"] = "float pixels are temperatures in °C"
-        if around := _maybe_kelvin(train):
-            notes["maybe_kelvin"] = (
-                f"float pixels lie around {around:.0f}: kelvin would be {around - KELVIN_AT_0_C:.0f} °C"
-            )
-            log.warning(
-                "the float pixels of scene %s are read as °C, and lie around %.0f: is that a furnace, or kelvin? Of kelvin make "
-                "a scene in °C: python src/prepare.py source=IMAGES target=NEW_FOLDER %s poses=given poses.model=THIS_SCENE",
-                *(raw.name, around, CELSIUS_OF_KELVIN),
-            )
     if counts and bounds is None:
         bounds, notes["training_images_c"] = _range_of(train, counts)
         notes["bounds_source"] = "minimum and maximum of the training images without dead pixels: none were given"
     return replace(raw, counts=counts, thermal_range=bounds)
-
-
-def _maybe_kelvin(train: Sequence[PreparedImage]) -> float | None:
-    """The median of a few images where next to all pixels may be kelvin as well as °C of a furnace; else None."""
-    few = [train[i] for i in evenly_spread(len(train), DEAD_PIXEL_FRAMES)]
-    known = [p.thermal if p.mask is None else p.thermal[p.mask] for p in few]
-    ends = [np.percentile(values, (1, 50, 99)) for values in known if values.size]
-    if not ends or not all(MAYBE_KELVIN[0] < low and high < MAYBE_KELVIN[1] for low, _, high in ends):
-        return None
-    return float(np.median([middle for _, middle, _ in ends]))
 
 
 def _with_pseudo_colour(

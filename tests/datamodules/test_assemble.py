@@ -235,23 +235,6 @@ def project(camera, xyz):
     return (pix[:2] / pix[2]).T
 
 
-def test_floats_that_may_be_kelvin_are_told(caplog):
-    """Nothing tells a room in kelvin from a furnace in °C, so neither is refused."""
-    images = [285 + grey(i).astype(np.float32) / 20 for i in range(9)]
-    images[3][0, 0] = 0.0  # a dead pixel
-    with caplog.at_level(logging.WARNING):
-        scene = scene_of(images)
-    assert "lie around 29" in caplog.text and "counts.offset_c=-273.15 poses=given" in caplog.text
-    assert scene.notes["maybe_kelvin"].startswith("float pixels lie around 29")
-    caplog.clear()
-    for other in ([i - 273.15 for i in images], [i + 700 for i in images], [i - 100 for i in images]):
-        with caplog.at_level(logging.WARNING):
-            scene = scene_of(other)
-        assert "kelvin" not in caplog.text and "maybe_kelvin" not in scene.notes
-    scene = scene_of(images, counts=Counts(1.0, -273.15))
-    assert "kelvin" not in caplog.text and scene.thermal_range.max_c < 40
-
-
 def test_utm_coordinates_are_recentred_before_float32():
     utm = np.array([651234.25, 5683456.5, 30.0])
     images = [grey(i) for i in range(9)]
