@@ -1,9 +1,7 @@
 """A sweep that fills the leaderboard."""
 
-import pytest
 from boards import board, protocol_folder
 
-from heatsplat.contracts import SceneError
 from heatsplat.studies.leaderboard.sweep import Leaderboard
 
 
@@ -15,10 +13,3 @@ def test_one_job_of_each_method_and_track_shows_whether_all_compose(tmp_path):
     methods = sorted(text for job in plan.to_compose(jobs) for text in job if text.startswith("method="))
     assert set(methods) == {"method=3dgs", "method=etgs", "method=supirgs"} and len(methods) < len(jobs)
     assert Leaderboard(board(tmp_path, train=False)).idle
-
-
-def test_several_values_of_a_setting_are_refused_for_one_alone_would_count(tmp_path):
-    plan = Leaderboard(board(protocol_folder(tmp_path, "cooling")))
-    with pytest.raises(SceneError, match=r"^max_steps: a leaderboard has one run for each seed"):
-        plan.jobs([["threads=1", "max_steps=5"], ["threads=1", "max_steps=9"]], None)
-    assert plan.jobs([[]], None) == (plan.board.jobs(), 0)

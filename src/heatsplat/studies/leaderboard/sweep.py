@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from heatsplat.contracts import SceneError
-from heatsplat.io.command_lines import key_of
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.leaderboard.report import write_leaderboard
 from heatsplat.studies.sweep_plan import FolderOf, Overrides, SweepPlan
@@ -34,15 +32,8 @@ class Leaderboard(SweepPlan):
         return self.board.summary()
 
     def jobs(self, grid: Sequence[Overrides], folder_of: FolderOf) -> tuple[list[Overrides], int]:
-        """All of the board. Raises SceneError where the command line gives a key several values: a run of each seed counts."""
-        if len(grid) > 1:
-            every = [set(given) for given in grid]
-            several = sorted({key_of(text) for given in every for text in given - set.intersection(*every)})
-            raise SceneError(
-                f"{', '.join(several)}: a leaderboard has one run for each seed, so of several values one would count; give one "
-                "value, and each of the others a leaderboard of its own (hydra.sweep.dir=FOLDER)"
-            )
-        return self.board.jobs(*grid), 0
+        """All of the board with one combination of the grid before the next."""
+        return [job for given in grid for job in self.board.jobs(given)], 0
 
     def to_compose(self, jobs: Sequence[Overrides]) -> Sequence[Overrides]:
         """One job of each method and track."""
