@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError, ThermalRange
-from heatsplat.datamodules.side_files import finite, json_object, says_fahrenheit
+from heatsplat.datamodules.side_files import finite, json_object, says_fahrenheit, says_kelvin
 from heatsplat.physics.units import KELVIN_AT_0_C
 
 BOUNDS_FILE = "temperature_bounds.json"
@@ -24,12 +24,14 @@ def celsius(value: Any, where: str) -> float:
 
 
 def celsius_in(values: Mapping[str, Any], key: str, path: Path) -> float:
-    """The temperature under ``key``. Raises SceneError naming file and key when it is missing or none, or in °F."""
+    """The temperature under ``key``. Raises SceneError naming file and key when it is missing or none, or in °F or kelvin."""
     for name, unit in values.items():
-        if "unit" in name.lower() and isinstance(unit, str) and says_fahrenheit(f"unit: {unit}"):
+        if "unit" not in name.lower() or not isinstance(unit, str):
+            continue
+        told = f"unit: {unit}"
+        if instead := "(F - 32) / 1.8" if says_fahrenheit(told) else "K - 273.15" if says_kelvin(told) else None:
             raise SceneError(
-                f"{path}: {name!r} is {unit!r}, and temperatures are read in °C: write (F - 32) / 1.8 for each, and leave "
-                f"{name!r} out"
+                f"{path}: {name!r} is {unit!r}, and temperatures are read in °C: write {instead} for each, and leave {name!r} out"
             )
     if key not in values:
         raise SceneError(f"{path} has no key {key!r}; it has {', '.join(values) or 'none'}")

@@ -9,7 +9,13 @@ from pathlib import Path
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.side_files import found_file, read_table
-from heatsplat.datamodules.timestamps import dji_time, time_by_pattern, times_from_csv
+from heatsplat.datamodules.timestamps import (
+    dji_time,
+    is_of_day,
+    time_by_pattern,
+    times_from_csv,
+    unrolled_midnight,
+)
 
 FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
 
@@ -53,8 +59,12 @@ class FrameTimes:
         if self.time_csv:
             return self._table(folder, names)
         if self.time_regex:
-            times = {name: time_by_pattern(name, self.time_regex, self.time_format) for name in names}
-            return times, f"file names, {self.time_regex} as {self.time_format or 'seconds'}"
+            told = f"file names, {self.time_regex} as {self.time_format or 'seconds'}"
+            seconds = [time_by_pattern(name, self.time_regex, self.time_format) for name in names]
+            if is_of_day(self.time_format):
+                seconds, passed = unrolled_midnight(seconds)
+                told += "; 24 h were added to those after midnight" if passed else ""
+            return dict(zip(names, seconds, strict=True)), told
         if written is not None:
             return written, where
         path = folder / FRAMES_FILE  # without times where a frame had none

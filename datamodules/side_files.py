@@ -15,11 +15,17 @@ from typing import Any
 
 from heatsplat.contracts import SceneError
 
-# How programs name the unit beside numbers: in words, or as F where a unit is told (text, JSON, GDAL's metadata).
-FAHRENHEIT = re.compile(
-    r"°\s*F\b|\bdeg(?:rees?)?[\s_]*F\b|\bfahrenheit\b|units?[\"']?\s*[=:]\s*[\"']?F\b(?![-/])|unittype\"[^<>]*>\s*F\b",
-    re.IGNORECASE,
-)
+
+def _named(word: str, letter: str) -> re.Pattern[str]:
+    """How programs name a unit beside numbers: in words, or by its letter where a unit is told (text, JSON, GDAL's metadata)."""
+    return re.compile(
+        rf"°\s*{letter}\b|\bdeg(?:rees?)?[\s_]*{letter}\b|\b{word}\b|units?[\"']?\s*[=:]\s*[\"']?{letter}\b(?![-/])|"
+        rf"unittype\"[^<>]*>\s*{letter}\b",
+        re.IGNORECASE,
+    )
+
+
+FAHRENHEIT, KELVIN = _named("fahrenheit", "F"), _named("kelvins?", "K")
 
 
 def found_file(key: str, path: str | Path, folder: Path | None) -> Path:
@@ -93,6 +99,11 @@ def finite(value: Any, where: str, what: str = "a number") -> float:
 def says_fahrenheit(text: str) -> bool:
     """Whether text beside numbers says that they are °F."""
     return FAHRENHEIT.search(text) is not None
+
+
+def says_kelvin(text: str) -> bool:
+    """Whether text beside numbers says that they are kelvin; it may mean differences, such as a resolution."""
+    return KELVIN.search(text) is not None
 
 
 def shortened(value: Any, most: int = 60) -> str:

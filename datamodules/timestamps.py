@@ -59,6 +59,11 @@ def unrolled_midnight(times_s: Sequence[float]) -> tuple[list[float], bool]:
     return [t + DAY_S if t <= last_of_next_day else t for t in times_s], True
 
 
+def is_of_day(form: str | None) -> bool:
+    """Whether times that are written in a form of ``time_by_pattern`` begin anew every midnight."""
+    return form is not None and (form == "HHMMSSmmm" or not set(re.findall(r"%([^%])", form)) - set("HIpMSfzZX"))
+
+
 def dji_time(name: str) -> float | None:
     """Seconds of a DJI name such as DJI_20240806173449_0008_T.JPG (whole seconds, the camera's clock), or None."""
     match = DJI_NAME.search(PurePosixPath(name).name)

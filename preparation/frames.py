@@ -23,6 +23,7 @@ from heatsplat.datamodules.formats.images import (
     pages_of,
     read_image,
     resized,
+    shown_files,
     to_grey,
 )
 from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
@@ -102,7 +103,7 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         raise SceneError(f"source={folder} is no folder")
     kinds: dict[str, list[Path]] = {}
     greys_known = reading.meaning.of_greys(folder)[0] is not None
-    found = [p for p in folder.rglob("*") if p.suffix.lower() in (*SUFFIXES, *RECORDS, TABLE) and p.is_file()]
+    found = [path for path in shown_files(folder, (*SUFFIXES, *RECORDS, TABLE)) if path.is_file()]
     for path in sorted(found, key=lambda p: by_numbers(p.relative_to(folder).as_posix())):
         kind = _kind(path)
         if kind is None:

@@ -11,12 +11,10 @@ import numpy as np
 from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.dji import PER_KELVIN
-from heatsplat.datamodules.formats.images import tiff_text
-from heatsplat.datamodules.formats.radiometric import CELSIUS_OF_FAHRENHEIT, Calibration
-from heatsplat.datamodules.side_files import says_fahrenheit
+from heatsplat.datamodules.formats.radiometric import Calibration, other_unit
 from heatsplat.physics.planck import Band
 from heatsplat.physics.radiometry import BandResponse, PlanckResponse
-from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, USUAL_MEDIAN_C, is_centikelvin
+from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, MAYBE_KELVIN, USUAL_MEDIAN_C, is_centikelvin
 
 # °C per count of other cameras that store kelvin; nothing in a file tells them apart, so they are named and asked for.
 OTHERS = {
@@ -32,8 +30,6 @@ SETTINGS = {
     "float": ("counts.scale", "counts.offset_c"),
     "grey": ("bounds_c",),
 }
-# Floats in this range may be kelvin of a room or °C of a furnace; nothing tells.
-MAYBE_KELVIN = (200.0, 400.0)
 
 
 @dataclass(frozen=True)
@@ -132,17 +128,17 @@ class Meaning:
         """The calibration of floating-point images and a sentence about it.
 
         Raises:
-            SceneError: nothing was said, and they may be kelvin, or the file says that they are °F.
+            SceneError: nothing was said, and they may be kelvin, or the file says that they are, or °F.
         """
         if self.scale is not None or self.offset_c is not None:
             scale = 1.0 if self.scale is None else self.scale
             # A scale alone is one of kelvin, as of counts.
             offset = -KELVIN_AT_0_C if self.offset_c is None else self.offset_c
             return self.of_temperatures(scale, offset), f"floats: °C = {scale:g} * value {offset:+g}"
-        if says_fahrenheit(tiff_text(path)):
+        if other := other_unit(sample, path):
             raise SceneError(
-                f"{path} says that its numbers are °F: give {CELSIUS_OF_FAHRENHEIT}, or "
-                "counts.offset_c=0 where they are °C all the same"
+                f"{path} says that its numbers are {other[0]}: give {other[1]}, or counts.offset_c=0 where they are °C all the "
+                "same"
             )
         finite = sample[np.isfinite(sample)]
         if finite.size and MAYBE_KELVIN[0] < np.median(finite) < MAYBE_KELVIN[1]:

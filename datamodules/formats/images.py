@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -149,8 +149,17 @@ def _is_truncated_jpeg(data: bytes) -> bool:
 
 
 def list_images(folder: Path) -> list[str]:
-    """Paths of all image files below ``folder``, relative to it with forward slashes, sorted."""
-    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES)
+    """Paths of all image files below ``folder`` that are not hidden, relative to it with forward slashes, sorted."""
+    return sorted(path.relative_to(folder).as_posix() for path in shown_files(folder, SUFFIXES))
+
+
+def shown_files(folder: Path, suffixes: Collection[str]) -> Iterator[Path]:
+    """Files below ``folder`` whose names end so, in lower case; none that is hidden (".") or in a hidden folder, such as what
+    macOS puts beside each file of a card ("._IMG_0042.jpg") and the thumbnails of other programs."""
+    for path in folder.rglob("*"):
+        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if not hidden and path.suffix.lower() in suffixes:
+            yield path
 
 
 class ImageIndex:

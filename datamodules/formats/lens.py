@@ -150,4 +150,8 @@ def undistortion_maps(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if min(size) > 1:
         (x_down, x_right), (y_down, y_right) = np.gradient(x), np.gradient(y)
         valid &= x_right * y_down - x_down * y_right > 0
+        # Farther out a polynomial that has passed zero shows the other side of the image, upside down but not as in a mirror.
+        middle_x, middle_y = matrix[:2, 2]
+        rows, columns = np.mgrid[: lens.height, : lens.width]
+        valid &= (x - middle_x) * (columns - middle_x) + (y - middle_y) * (rows - middle_y) >= 0
     return x, y, valid

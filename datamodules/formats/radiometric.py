@@ -16,9 +16,9 @@ from torch import Tensor
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats import dji, flir
 from heatsplat.datamodules.formats.images import read_image, tiff_text
-from heatsplat.datamodules.side_files import says_fahrenheit
+from heatsplat.datamodules.side_files import says_fahrenheit, says_kelvin
 from heatsplat.physics.radiometry import BandResponse, Conditions, Response, surface_temperature
-from heatsplat.physics.units import KELVIN_AT_0_C
+from heatsplat.physics.units import KELVIN_AT_0_C, MAYBE_KELVIN
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,9 @@ class Calibration:
 
 
 CELSIUS = Calibration(scale=1.0)
-# Settings of a preparation that make °C of °F.
+# Settings of a preparation that make °C of °F, and of kelvin.
 CELSIUS_OF_FAHRENHEIT = f"counts.scale={1 / 1.8:.6f} counts.offset_c={-32 / 1.8:.4f}"
+CELSIUS_OF_KELVIN = f"counts.offset_c={-KELVIN_AT_0_C:g}"
 
 
 def surface_celsius(stored: np.ndarray, calibration: Calibration, conditions: Conditions | None = None) -> np.ndarray:
@@ -101,13 +102,27 @@ def read_thermal(path: Path) -> np.ndarray:
     """The pixels of a thermal image as they are stored (``read_image``); floating-point ones are °C.
 
     Raises:
-        SceneError: as ``read_image``, or a floating-point TIFF says that its numbers are °F.
+        SceneError: as ``read_image``, or a floating-point TIFF says that its numbers are °F or kelvin.
     """
     pixels = read_image(path)
-    if pixels.dtype == np.float32 and says_fahrenheit(tiff_text(path)):
+    if pixels.dtype == np.float32 and (other := other_unit(pixels, path)):
+        unit, settings = other
         raise SceneError(
-            f"{path} says that its numbers are °F, and °C are read. Make a scene in °C of the images: python src/prepare.py "
-            f"source={path.parent} target=NEW_FOLDER {CELSIUS_OF_FAHRENHEIT} poses=given poses.model=THIS_SCENE "
+            f"{path} says that its numbers are {unit}, and °C are read. Make a scene in °C of the images: python src/prepare.py "
+            f"source={path.parent} target=NEW_FOLDER {settings} poses=given poses.model=THIS_SCENE "
             "(counts.offset_c=0 alone where they are °C all the same)"
         )
     return pixels
+
+
+def other_unit(pixels: np.ndarray, path: Path) -> tuple[str, str] | None:
+    """The unit that a TIFF says its floating-point numbers have, and the settings of a preparation that make °C of them; None
+    where it is °C, or not said. Kelvin that the numbers cannot be, as most are too small, are those of something else.
+    """
+    told = tiff_text(path)
+    if says_fahrenheit(told):
+        return "°F", CELSIUS_OF_FAHRENHEIT
+    finite = pixels[np.isfinite(pixels)]
+    if says_kelvin(told) and finite.size and np.median(finite) > MAYBE_KELVIN[0]:
+        return "kelvin", CELSIUS_OF_KELVIN
+    return None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,7 +21,8 @@ def read_temperature_table(path: Path) -> np.ndarray | None:
     """The numbers [H, W] float32 of an image that was exported as text; None where a file holds no such table.
 
     Lines may stand before and after the table, and its first row and column may count pixels, which are left out. Cells stand
-    between tabs, semicolons (both with decimal commas or points) or commas; empty ones are NaN.
+    between tabs, semicolons (both with decimal commas or points) or commas (with decimal commas in quotes); those without a
+    number are NaN.
 
     Raises:
         SceneError: the file cannot be read, holds several images, or says that its numbers are °F.
@@ -61,7 +64,7 @@ def _tables(lines: list[str], separator: str) -> Iterator[tuple[int, np.ndarray]
     for number, line in enumerate([*lines, ""]):
         row = _numbers(line, separator)
         if rows and len(row) != len(rows[0]):
-            if len(rows) >= MIN_SIDE:
+            if len(rows) >= MIN_SIDE and not _is_of_records(rows):
                 yield start, np.array(rows, np.float32)
             rows = []
         if row:
@@ -69,21 +72,39 @@ def _tables(lines: list[str], separator: str) -> Iterator[tuple[int, np.ndarray]
             rows.append(row)
 
 
-def _numbers(line: str, separator: str) -> list[float]:
-    """The numbers of a line; none where it has fewer than ``MIN_SIDE`` or anything else."""
-    if separator != ",":
-        line = line.replace(",", ".")
-    cells = line.replace('"', "").split(separator)
+def _is_of_records(rows: list[list[float | None]]) -> bool:
+    """Whether a column has words in most rows, such as the times of a weather record."""
+    words = Counter(column for row in rows if None in row for column, cell in enumerate(row) if cell is None)
+    return bool(words) and 2 * max(words.values()) > len(rows)
+
+
+def _numbers(line: str, separator: str) -> list[float | None]:
+    """The numbers of a line, NaN for an empty cell and None for one with words; none where it has fewer than ``MIN_SIDE`` cells,
+    or half are words."""
+    if '"' not in line:
+        cells = line.split(separator)
+    else:  # around cells with a decimal comma, where commas separate these
+        try:
+            cells = next(csv.reader([line], delimiter=separator))
+        except csv.Error:
+            return []
+    cells = [cell.replace(",", ".").replace('"', "") for cell in cells]
     if len(cells) > MIN_SIDE and not cells[-1].strip():  # rows may end, and begin, with a separator
         cells.pop()
     if len(cells) > MIN_SIDE and not cells[0].strip():
         cells.pop(0)
     if len(cells) < MIN_SIDE or not any(cells):
         return []
+    found = [_number(cell.strip() or "nan") for cell in cells]
+    return [] if 2 * found.count(None) >= len(found) else found
+
+
+def _number(cell: str) -> float | None:
+    """The number in a cell; None where it is none, as of a pixel that is too hot (">150")."""
     try:
-        return [float(cell or "nan") for cell in cells]
+        return float(cell)
     except ValueError:
-        return []
+        return None
 
 
 def _without_counts(table: np.ndarray) -> np.ndarray:

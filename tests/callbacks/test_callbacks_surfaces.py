@@ -11,6 +11,7 @@ from fake_run import RANGE, WIDTH, wall, warmth
 
 from heatsplat.callbacks import surfaces
 from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE, ExtremeSurfaces, best_two
+from heatsplat.contracts import ViewSet
 from heatsplat.export.place import Place
 from heatsplat.geometry.alignment import Similarity
 from heatsplat.geometry.looks import Look, surface_points
@@ -39,6 +40,20 @@ def test_the_warm_patch_is_found(tmp_path):
     assert [hottest[axis] for axis in "xyz"] == pytest.approx([-0.5, 0.1, 4.0], abs=0.08)
     assert rows[-1]["kind"] == "coldest" and rows[-1]["mean_c"] < 15
     assert (tmp_path / SURFACES_PICTURE).stat().st_size > 1000 and WIDTH == 56
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_surfaces_are_seen_without_what_is_known_of_single_images(tmp_path, timed):
+    """Such as the level of an image of wild_thermal, which drifts."""
+    scene, seen = wall(), []
+    views = scene.train
+    if not timed:
+        views = ViewSet([replace(frame, time_s=None) for frame in views.frames], lambda i: scene.train[i])
+    module = SimpleNamespace(scene=replace(scene, train=views), modality="thermal", output_dir=tmp_path)
+    module.render = lambda frame, **asked: seen.append(frame) or render(replace(frame, time_s=0.0), **asked)
+    ExtremeSurfaces(views=4, share=0.02).on_test_epoch_end(None, module)
+    taken = {frame.frame_id for frame in scene.frames}
+    assert len(seen) == 4 and not taken & {frame.frame_id for frame in seen}
 
 
 def test_images_that_are_no_temperatures_have_none(tmp_path):

@@ -1,6 +1,7 @@
 """CostMeter: what is timed and what is not, memory, and going on after a resume."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,6 +57,16 @@ def test_compiling_and_evaluation_are_not_training(tmp_path):
     evaluate(module, job)
     assert 10 < module.results.cost["render_fps"] <= 50
     assert module.results.cost["train_seconds"] == cost["train_seconds"]
+
+
+@pytest.mark.parametrize(("views", "timed"), [(2, [0, 1]), (3, [0, 1, 2]), (6, [0, 1, 3, 4])])
+def test_the_frame_rate_is_that_of_views_all_over_the_test_each_once(tmp_path, monkeypatch, views, timed):
+    module = Slow(wall(), tmp_path)
+    module.scene = replace(module.scene, test=module.scene.train.subset([*range(views)]))
+    meter, seen = CostMeter(), []
+    monkeypatch.setattr(meter, "_render_seconds", lambda _, frames: seen.extend(frames) or [1.0])
+    meter.on_test_epoch_end(None, module)
+    assert [frame.frame_id for frame in seen] == [module.scene.test.frames[i].frame_id for i in timed]
 
 
 def test_a_resumed_run_goes_on_counting(tmp_path):

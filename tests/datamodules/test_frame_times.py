@@ -54,3 +54,21 @@ def test_a_table_that_lacks_an_image_is_refused(folder):
         SceneError, match=f"data.time_csv=other.csv: there is no file {folder}/other.csv and no {Path.cwd()}/other.csv"
     ):
         FrameTimes(time_csv="other.csv").of(folder, NAMES)
+
+
+@pytest.mark.parametrize(
+    ("form", "late", "early"), [("HHMMSSmmm", "235900000", "000100000"), ("%H-%M", "23-59", "00-01")]
+)
+def test_names_with_the_time_of_day_go_on_past_midnight(tmp_path, form, late, early):
+    told = FrameTimes(time_regex=r"_([\d-]+)", time_format=form)
+    names = [f"a_{early}.png", f"b_{late}.png"]
+    times, note = told.of(tmp_path, names)
+    assert times[names[0]] - times[names[1]] == 120.0 and note.endswith("; 24 h were added to those after midnight")
+    times, note = told.of(tmp_path, [name.replace("23", "01") for name in names])
+    assert abs(max(times.values()) - min(times.values()) - 7080.0) < 1e-6 and "midnight" not in note
+
+
+def test_names_with_a_date_are_not_moved(tmp_path):
+    told = FrameTimes(time_regex=r"_(\d+)", time_format="%Y%m%d%H%M")
+    times, note = told.of(tmp_path, names := ["a_202408060001.png", "b_202408062359.png"])
+    assert times[names[1]] - times[names[0]] == 23 * 3600 + 58 * 60 and "midnight" not in note

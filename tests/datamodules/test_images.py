@@ -93,6 +93,13 @@ def test_other_pixel_types_are_refused(tmp_path):
         read_image(tmp_path / "a.tiff")
 
 
+def test_hidden_files_are_no_images(tmp_path):
+    for name in ("a.png", ".hidden/a.png"):
+        write_image(tmp_path / name, np.zeros((2, 2), np.uint8))
+    (tmp_path / "._a.png").write_bytes(b"\0\x05\x16\x07")
+    assert ImageIndex(tmp_path).names == ["a.png"] and ImageIndex(tmp_path / ".hidden").names == ["a.png"]
+
+
 def test_names_are_found_up_to_case_and_extension(tmp_path):
     for name in ("a.PNG", "sub/b.jpg"):
         write_image(tmp_path / name.lower(), np.zeros((2, 2), np.uint8))

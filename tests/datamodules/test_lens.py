@@ -92,6 +92,15 @@ def test_where_the_polynomial_folds_back_nothing_is_valid():
     assert valid[radius < 0.70].all()
 
 
+def test_nothing_is_valid_either_where_it_has_passed_the_middle():
+    # r_d = r - 0.6 r^3 is negative beyond r = 1.29, and grows from there as a picture that is turned round does.
+    lens = Lens(fx=20, fy=20, cx=32, cy=24, width=64, height=48, distortion=(-0.6, 0, 0, 0, 0, 0, 0, 0))
+    valid = undistortion_maps(lens)[2]
+    y, x = np.mgrid[:48, :64] + 0.5
+    radius = np.hypot(x - 32, y - 24) / 20
+    assert radius.max() > 1.9 and not valid[radius > 0.80].any() and valid[radius < 0.70].all()
+
+
 def test_masks_are_undistorted_with_the_image():
     lens = lens_of("RADIAL", CAMERAS["RADIAL"], WIDTH, HEIGHT, "test")
     mask = np.ones((HEIGHT, WIDTH), bool)

@@ -198,14 +198,29 @@ def test_floats_whose_file_says_fahrenheit_are_refused_and_others_are_read(tmp_p
         read_thermal(tmp_path / "f.tiff")
 
 
+def test_floats_whose_file_says_kelvin_are_refused_unless_they_are_too_small(tmp_path):
+    room, furnace = np.full((4, 5), 295.0, np.float32), np.full((4, 5), 1100.0, np.float32)
+    for pixels in (room, furnace):
+        float_tiff(tmp_path / "k.tiff", pixels, '{"unit": "K"}')
+        with pytest.raises(
+            SceneError, match=r"k.tiff says that its numbers are kelvin, .* counts.offset_c=-273.15 poses=given"
+        ):
+            read_thermal(tmp_path / "k.tiff")
+    float_tiff(tmp_path / "c.tiff", room - 273.15, "NETD: 0.05 Kelvin")
+    np.testing.assert_array_equal(read_thermal(tmp_path / "c.tiff"), room - 273.15)
+    float_tiff(tmp_path / "hot.tiff", furnace, "unit=C")
+    np.testing.assert_array_equal(read_thermal(tmp_path / "hot.tiff"), furnace)
+
+
 @pytest.mark.parametrize("loader", ["colmap", "nerfstudio"])
-def test_a_scene_of_fahrenheit_is_not_trained_as_celsius(tmp_path, loader):
+@pytest.mark.parametrize(("low", "says", "unit"), [(60, "unit=F", "°F"), (280, "unit: K", "kelvin")])
+def test_a_scene_of_another_unit_is_not_trained_as_celsius(tmp_path, loader, low, says, unit):
     files = names(9, "frame_{:03d}.tiff")
     for i, name in enumerate(files):
         float_tiff(
             tmp_path / "images" / name,
-            np.linspace(60, 80 + i, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH),
-            "unit=F",
+            np.linspace(low, low + 20 + i, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH),
+            says,
         )
     if loader == "colmap":
         write_colmap(tmp_path, files, images=None)
@@ -218,5 +233,5 @@ def test_a_scene_of_fahrenheit_is_not_trained_as_celsius(tmp_path, loader):
         lens = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 20.0, "cy": 16.0, "w": WIDTH, "h": HEIGHT}
         write_json(tmp_path / "transforms.json", {**lens, "frames": frames})
         module = Nerfstudio(root=str(tmp_path), random_points=50)
-    with pytest.raises(SceneError, match="says that its numbers are °F"):
+    with pytest.raises(SceneError, match=f"says that its numbers are {unit}"):
         module.setup()

@@ -2,7 +2,7 @@
 
 import pytest
 
-from heatsplat.datamodules.side_files import says_fahrenheit
+from heatsplat.datamodules.side_files import says_fahrenheit, says_kelvin
 
 
 @pytest.mark.parametrize(
@@ -20,3 +20,17 @@ def test_text_that_says_fahrenheit(text):
 )
 def test_text_that_does_not(text):
     assert not says_fahrenheit(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["Unit: K", "unit=K", '{"unit": "K"}', "in kelvin", "Units: Kelvins", 'role="unittype">K<']
+)
+def test_text_that_says_kelvin(text):
+    assert says_kelvin(text) and not says_fahrenheit(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "Unit: °C", "unit=F", "K", "units: K/count", "Kelvinator", 'role="unittype">deg C<']
+)
+def test_text_that_says_no_kelvin(text):
+    assert not says_kelvin(text)

@@ -29,10 +29,21 @@ def counted(separator: str) -> str:
         (HEAD + table(";", comma=True, last=";")).encode("cp1252"),
         ("\ufeff" + table("\t").replace("\n", "\r\n") + "\r\n\r\nend").encode(),
         table("\t", comma=True).encode("utf-16"),
+        "\n".join(",".join(f'"{v:.2f}"' for v in row) for row in VALUES).replace(".", ",").encode(),
+        ('"' + table(";").replace(";", '";"').replace("\n", '"\n"') + '"').encode(),
         counted(";").encode(),
         counted(",").encode(),
     ],
-    ids=["commas", "semicolons and decimal commas", "tabs and Windows", "UTF-16", "counted", "counted, commas"],
+    ids=[
+        "commas",
+        "semicolons and decimal commas",
+        "tabs and Windows",
+        "UTF-16",
+        "commas and decimal commas",
+        "quotes",
+        "counted",
+        "counted, commas",
+    ],  # fmt: skip
 )
 def test_a_table_is_read_whatever_separates_it_and_stands_around_it(tmp_path, data):
     (tmp_path / "a.csv").write_bytes(data)
@@ -41,16 +52,24 @@ def test_a_table_is_read_whatever_separates_it_and_stands_around_it(tmp_path, da
     np.testing.assert_array_equal(found, VALUES)
 
 
-def test_empty_cells_are_unknown(tmp_path):
+@pytest.mark.parametrize("cell", ["", " ", ">150", "---"])
+def test_cells_without_a_number_are_unknown(tmp_path, cell):
     text = table(";").splitlines()
-    text[3] = text[3].replace(f";{VALUES[3, 5]:.2f};", ";;", 1)
+    text[3] = text[3].replace(f";{VALUES[3, 5]:.2f};", f";{cell};", 1)
     (tmp_path / "a.csv").write_text("\n".join(text))
     found = read_temperature_table(tmp_path / "a.csv")
     assert np.argwhere(np.isnan(found)).tolist() == [[3, 5]]
 
 
 @pytest.mark.parametrize(
-    "text", ["", "time,air_c\n0,12\n60,13\n", "\n".join(["1,2,3"] * 40), "\n".join(table(",").splitlines()[:9])]
+    "text",
+    [
+        "",
+        "time,air_c\n0,12\n60,13\n",
+        "\n".join(["1,2,3"] * 40),
+        "\n".join(table(",").splitlines()[:9]),
+        "\n".join(f"{i}:00,{row}" for i, row in enumerate(table(",").splitlines())),
+    ],  # fmt: skip
 )
 def test_what_is_no_image_is_none(tmp_path, text):
     (tmp_path / "a.csv").write_text(text)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from heatsplat.contracts import SceneData, View, ViewSet
+from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet
 from heatsplat.datamodules.points import random_points, told_random
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
@@ -38,6 +38,23 @@ def test_points_lie_on_surfaces_of_a_scene_that_cools_meanwhile(swept):
     on_surface, _ = Scene(PRESETS["cooling"]).nearest(points)
     away = (on_surface - points).norm(dim=1)  # in metres, from 2.2 m and at 64 pixels a pixel is 3 cm
     assert len(points) > 300 and away.median() < 0.03 and away.quantile(0.8) < 0.06
+
+
+def test_pixels_that_no_block_of_the_smaller_images_holds_move_no_point(monkeypatch):
+    """Images of 239 pixels become 23 of ten each; the rest is left out, and what is left lies where it did."""
+    monkeypatch.setattr(module, "WIDEST", 25)
+    K = torch.tensor([[200.0, 0.0, 119.5], [0.0, 200.0, 99.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    y, x = torch.meshgrid(torch.arange(199) + 0.5, torch.arange(239) + 0.5, indexing="ij")
+    views = []
+    for i, (right, down) in enumerate([(0.0, 0.0), (0.5, 0.1), (-0.5, 0.2), (0.1, 0.5), (-0.2, -0.5), (0.4, -0.4)]):
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, 3] = torch.tensor([-right, -down, 4.0])
+        across, along = (x - 119.5) / 50.0 + right, (y - 99.5) / 50.0 + down  # on a wall in z = 0, 4 away
+        image = 0.5 + 0.2 * torch.sin(3.1 * across + 1.7 * along) + 0.2 * torch.sin(4.3 * along - 2.2 * across + 1.0)
+        views.append(View(Frame(f"{i}.png", i, Camera(viewmat, K, 239, 199)), image.float()[..., None]))
+    train = ViewSet([view.frame for view in views], views.__getitem__)
+    points = swept_points(SceneData("wall", train, train, train, torch.zeros(4, 3)))
+    assert len(points) > 100 and abs(points[:, 2].median().item()) < 0.04
 
 
 def test_a_scene_with_points_keeps_them():

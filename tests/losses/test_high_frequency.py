@@ -193,6 +193,24 @@ def test_enlarged_images_are_found_by_name_and_read_to_full_depth(tmp_path, bits
         teacher.check(frame(1), FACTOR)
 
 
+def test_an_enlarged_image_serves_one_training_image_alone(tmp_path):
+    """Images of two cameras have one name each in folders of their own."""
+    Image.fromarray(np.zeros((48, 64), np.uint8)).save(tmp_path / "000.png")
+    teacher, left = load_teacher(str(tmp_path)), replace(frame(), name="left/000.png")
+    teacher.check(left, FACTOR)
+    teacher.check(left, FACTOR)
+    with pytest.raises(
+        SceneError, match=r"000.png would be that of left/000.png and of right/000.png: put enlarged images into"
+    ):
+        teacher.check(replace(frame(), name="right/000.png"), FACTOR)
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        Image.fromarray(np.zeros((48, 64), np.uint8)).save(tmp_path / side / "000.png")
+    teacher = load_teacher(str(tmp_path))
+    for side in ("left", "right"):
+        teacher.check(replace(frame(), name=f"{side}/000.png"), FACTOR)
+
+
 def test_an_enlarged_image_of_the_wrong_size_is_refused_before_training(tmp_path):
     for index in range(2):
         Image.fromarray(np.zeros((40, 64), np.uint8)).save(tmp_path / f"{index:03d}.png")

@@ -35,6 +35,15 @@ def test_frames_without_times_are_in_the_order_of_the_numbers_in_their_names(tmp
     assert any("4 of 4 frames have no time" in note for note in found.notes)
 
 
+def test_hidden_files_are_no_frames(tmp_path):
+    """macOS puts one beside each file that it copies to a card, and other programs keep thumbnails."""
+    write_images(tmp_path, {"a1.tiff": FLOATS, "a2.tiff": FLOATS})
+    for name in ("._a1.tiff", "._a2.jpg", "._table.csv", "._a.fff"):
+        (tmp_path / name).write_bytes(b"\0\x05\x16\x07Mac OS X")
+    write_images(tmp_path / ".thumbnails", {"a1.tiff": FLOATS})
+    assert [frame.name for frame in read_frames(tmp_path)] == ["a1", "a2"]
+
+
 def test_sequences_have_a_frame_each(tmp_path):
     frames = read_frames(write_sequence(tmp_path / "flight.seq").parent)
     assert [frame.name for frame in frames] == [f"flight_{i:06d}" for i in range(4)]

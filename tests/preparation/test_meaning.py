@@ -63,6 +63,19 @@ def test_floats_whose_file_says_fahrenheit_are_asked_about(tmp_path):
     assert Meaning(offset_c=0.0).of_floats(pixels, tmp_path / "a.tiff")[1].startswith("floats: °C = 1 * value")
 
 
+def test_floats_whose_file_says_kelvin_are_asked_about_however_hot(tmp_path):
+    pixels, tags = np.full((4, 5), 1100.0, np.float32), ImageFileDirectory_v2()
+    tags[270] = "unit: K"
+    Image.fromarray(pixels).save(tmp_path / "a.tiff", tiffinfo=tags)
+    with pytest.raises(
+        SceneError, match="a.tiff says .* kelvin: give counts.offset_c=-273.15, or counts.offset_c=0 where"
+    ):
+        Meaning().of_floats(pixels, tmp_path / "a.tiff")
+    assert celsius(Meaning(offset_c=-273.15).of_floats(pixels, tmp_path / "a.tiff")[0], [1100.0]) == pytest.approx(
+        [826.85]
+    )
+
+
 def test_greys_have_temperatures_where_there_are_bounds(tmp_path):
     assert Meaning().of_greys(tmp_path)[0] is None
     assert celsius(Meaning(bounds_c=[10, 40]).of_greys(tmp_path)[0], [0.0, 255.0]) == pytest.approx([10.0, 40.0])
@@ -72,13 +85,21 @@ def test_greys_have_temperatures_where_there_are_bounds(tmp_path):
     assert celsius(found, [100.0]) == pytest.approx([20.0]) and "temperature_bounds.json" in note
 
 
-@pytest.mark.parametrize("unit", ["F", "degF", "Fahrenheit"])
-def test_bounds_in_fahrenheit_are_refused(tmp_path, unit):
+@pytest.mark.parametrize(
+    ("unit", "instead"),
+    [
+        ("F", r"\(F - 32\)"),
+        ("degF", r"\(F - 32\)"),
+        ("Fahrenheit", r"\(F - 32\)"),
+        ("K", "K - 273.15"),
+        ("kelvin", "K - 273.15"),
+    ],
+)
+def test_bounds_in_another_unit_are_refused(tmp_path, unit, instead):
     bounds = {"absolute_min_temperature": 32, "absolute_max_temperature": 212, "Unit": unit}
     (tmp_path / "temperature_bounds.json").write_text(json.dumps(bounds))
-    with pytest.raises(
-        SceneError, match=rf"bounds.json: 'Unit' is '{unit}', and temperatures are read in °C: write \(F - 32\)"
-    ):
+    said = rf"bounds.json: 'Unit' is '{unit}', and temperatures are read in °C: write {instead}"
+    with pytest.raises(SceneError, match=said):
         Meaning().of_greys(tmp_path)
     (tmp_path / "temperature_bounds.json").write_text(json.dumps(bounds | {"Unit": "C"}))
     assert "32 .. 212 °C" in Meaning().of_greys(tmp_path)[1]

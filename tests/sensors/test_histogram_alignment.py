@@ -61,3 +61,10 @@ def test_an_image_that_its_mask_hides_has_the_histogram_of_all():
     views = ViewSet(scene.train.frames, lambda i: View(scene.train.frames[i], images[i], mask=hidden))
     with pytest.raises(SceneError, match="masks leave no pixel of the training images of scene 'flight'"):
         HistogramAlignment().prepare(replace(scene, train=views))
+
+
+def test_photos_have_no_such_histogram():
+    scene, _ = drifted()
+    photos = ViewSet(scene.train.frames, lambda i: View(scene.train.frames[i], None, rgb=torch.rand(16, 24, 3)))
+    with pytest.raises(SceneError, match="view 0.png has no thermal image; choose a method or data set that fits"):
+        HistogramAlignment().prepare(replace(scene, train=photos))

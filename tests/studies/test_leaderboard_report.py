@@ -46,6 +46,21 @@ def test_the_table_has_ranks_reasons_and_costs(tmp_path):
     assert {row["method"] for row in rows if row["reason"]} == {"3dgs", "etgs", "supirgs"} and len(rows) == 8
 
 
+def test_a_sweep_without_results_replaces_no_document(tmp_path, caplog):
+    """Such as one that failed before its first run, or a folder that was mistyped."""
+    root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
+    sweep.mkdir()
+    documents = [tmp_path / "board.md", tmp_path / "board.html"]
+    for document in documents:
+        document.write_text("of weeks")
+    asked = board(root, document=str(documents[0]), page=str(documents[1]))
+    assert {path.parent for path in write_leaderboard(sweep, asked)} == {sweep} and "no result in" in caplog.text
+    assert [document.read_text() for document in documents] == ["of weeks"] * 2
+    run_of(sweep, "3dgs", "cooling", 0, 1.0)
+    write_leaderboard(sweep, asked)
+    assert all("of weeks" not in document.read_text() for document in documents)
+
+
 def test_more_is_better_where_the_score_says_so(tmp_path):
     root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
     for method, off in (("3dgs", 1.0), ("etgs", 0.1)):

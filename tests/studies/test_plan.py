@@ -85,6 +85,11 @@ def test_the_command_is_refused_before_anything_runs(tmp_path, monkeypatch, capl
     taken = submission(tmp_path / "theirs", 0.1, method="3dgs")
     for asked, arguments, message in (
         ({}, ["experiment=leaderboard", "seed=0,1"], "leaderboard.seeds=[...]"),
+        (
+            {},
+            ["experiment=leaderboard", "threads=1", "max_steps=5,9"],
+            "max_steps: a leaderboard has one run of each method,",
+        ),
         ({"submissions": [str(taken)]}, ["experiment=leaderboard"], "give the submission another name"),
         ({"earlier": str(tmp_path / "none.html")}, ["experiment=leaderboard"], "cannot be read"),
     ):

@@ -4,8 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
-from boards import ASKED, board, hand_in, protocol_folder, run_of
+from boards import ASKED, VIEWS, board, hand_in, protocol_folder, run_of, truth
 
+from heatsplat.io.tiff import write_temperature
 from heatsplat.studies.leaderboard.plan import board_of
 from heatsplat.studies.leaderboard.standings import (
     Entry,
@@ -66,6 +67,24 @@ def test_a_seed_counts_once(tmp_path):
     (tmp_path / "other" / "3dgs_cooling_steps_0").rename(sweep / "etgs_cooling_steps_0")
     (entry,) = (one for one in standings(sweep, board(root)).entries if one.seeds)
     assert entry.all_numbers == [0] and entry.mean("mae_c") == pytest.approx(1.0, abs=1e-4)
+
+
+def test_a_score_of_a_scene_that_was_made_anew_is_worked_out_anew(tmp_path):
+    """``study=scenes`` into a folder whose scenes were deleted, as with another seed."""
+    root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
+    run_of(sweep, "3dgs", "cooling", 0, 1.0)
+
+    def score():
+        (entry,) = (one for one in standings(sweep, board(root)).entries if one.seeds)
+        return entry.mean("mae_c")
+
+    assert score() == pytest.approx(1.0, abs=1e-4)
+    for view in VIEWS:
+        write_temperature(root / "truth" / "cooling" / f"{view}.tiff", truth(view) + 3.0)
+    assert score() == pytest.approx(1.0, abs=1e-4)  # as far as anybody was told it is the same scene
+    meta = root / "scenes" / "cooling" / "meta.json"
+    meta.write_text(meta.read_text().replace("{", '{"scene_seed": 1, '))
+    assert score() == pytest.approx(2.0, abs=1e-4)
 
 
 def test_of_a_score_of_which_more_is_better_the_difference_stands_beside_the_reference(tmp_path):

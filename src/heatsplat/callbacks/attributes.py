@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytorch_lightning as pl
 import torch
@@ -14,7 +16,7 @@ from heatsplat.io.pictures import Bar, Panel, colorize, compose, text_panel, wri
 from heatsplat.io.quantities import impossible, words_and_unit
 from heatsplat.io.tables import write_csv
 from heatsplat.metrics.attribute_errors import attribute_errors
-from heatsplat.shots import at_time
+from heatsplat.shots import at_time, first_free_id
 from heatsplat.uncertainty import Uncertainty
 
 LEARNED_FILE = "learned.csv"
@@ -93,7 +95,10 @@ class LearnedValues(pl.Callback):
         self.deviations = deviations
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        scene, frame = module.scene, module.scene.train.frames[0]
+        scene = module.scene
+        frame = replace(
+            scene.train.frames[0], frame_id=first_free_id(scene)
+        )  # what is known of that one image is not meant
         if frame.time_s is not None:
             frame = at_time(scene, frame, scene.middle_s)
         told = module.attributes(frame)

@@ -23,7 +23,7 @@ from heatsplat.geometry.projection import to_camera, to_pixels
 from heatsplat.io.pictures import Bar, Panel, colorize, compose, enlarged, lettering, write_png
 from heatsplat.io.quantities import moment
 from heatsplat.io.tables import write_csv
-from heatsplat.shots import SIGHTING_SIZE, at_time
+from heatsplat.shots import SIGHTING_SIZE, at_time, first_free_id
 
 SURFACES_FILE = "surfaces.csv"
 SURFACES_PICTURE = "renders/surfaces.png"
@@ -106,11 +106,12 @@ def on_earth(place: Place | None, points: Sequence[Tensor]) -> list[dict[str, An
 
 
 def middle(scene: SceneData, frame: Frame) -> Frame:
-    """A frame at the moment of the training image nearest to the middle of the record, small enough for a look; in scenes
-    without time, as it is."""
+    """What the camera of a frame sees at the moment of the training image nearest to the middle of the record, where there is
+    time, small enough for a look. It is no training image: what the model knows of that one, such as how far its level had
+    drifted, is not true of surfaces."""
     if frame.time_s is not None:
         frame = at_time(scene, frame, scene.middle_s)
-    return replace(frame, camera=frame.camera.within(SIGHTING_SIZE))
+    return replace(frame, camera=frame.camera.within(SIGHTING_SIZE), frame_id=first_free_id(scene))
 
 
 @torch.no_grad()

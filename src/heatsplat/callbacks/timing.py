@@ -154,7 +154,8 @@ class CostMeter(pl.Callback):
         module.results.put("cost", "gaussians", len(module.splats))
         frames = module.scene.test.frames
         if frames:
-            chosen = [frames[i * len(frames) // self.fps_views] for i in range(min(self.fps_views, len(frames)))]
+            count = min(self.fps_views, len(frames))
+            chosen = [frames[i * len(frames) // count] for i in range(count)]
             module.results.put("cost", "render_fps", 1.0 / statistics.median(self._render_seconds(module, chosen)))
         else:
             module.results.put("cost", "render_fps", None, "the scene has no test views")

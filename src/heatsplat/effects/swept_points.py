@@ -70,8 +70,12 @@ def _shrunk(view: View) -> Tensor:
     image = view.thermal.mean(2).double()
     if view.mask is not None:
         image = torch.where(view.mask, image, torch.nan)
-    factor = math.ceil(max(image.shape) / WIDEST)
-    return functional.avg_pool2d(image[None, None], factor)[0, 0]
+    return functional.avg_pool2d(image[None, None], _block(view.camera))[0, 0]
+
+
+def _block(camera: Camera) -> int:
+    """Pixels along each side of those of which a swept image has the mean; at the right and below some may be left out."""
+    return math.ceil(max(camera.height, camera.width) / WIDEST)
 
 
 def _beside(cameras: Sequence[Camera], k: int, middle: Tensor) -> list[int]:
@@ -86,7 +90,6 @@ def _swept(
 ) -> Tensor:
     """Points [n, 3] of one view."""
     image, camera = images[k], cameras[k]
-    height, width = image.shape
     side = 2 * REACH + 1
     patches = image.unfold(0, side, 1).unfold(1, side, 1).flatten(2)  # [H - 2 REACH, W - 2 REACH, side²]
     texture = patches.std(2).nan_to_num(0.0).flatten()
@@ -102,9 +105,10 @@ def _swept(
     at = (
         torch.stack([(order % across)[:, None] + right.flatten(), (order // across)[:, None] + down.flatten()], 2) + 0.5
     )
-    scale = at.new_tensor([camera.width / width, camera.height / height])
     matrix, viewmat = camera.K.double(), camera.viewmat.double()
-    rays = torch.linalg.solve(matrix, torch.cat([at * scale, torch.ones_like(at[..., :1])], 2)[..., None])[..., 0]
+    rays = torch.linalg.solve(matrix, torch.cat([_block(camera) * at, torch.ones_like(at[..., :1])], 2)[..., None])[
+        ..., 0
+    ]
     away = float((middle - camera.center.double()).norm())
     depths = 1.0 / torch.linspace(1.0 / (FARTHEST * away), 1.0 / (NEAREST * away), DEPTHS, dtype=torch.float64)
     scores = torch.stack([_alike(own, rays, depths, viewmat, cameras[i], images[i]) for i in others])
@@ -131,7 +135,8 @@ def _alike(own: Tensor, rays: Tensor, depths: Tensor, viewmat: Tensor, camera: C
     local = to_camera(world.flatten(0, 2), camera.viewmat.double())
     ahead = local[:, 2] > 1e-6
     pixels = (local @ camera.K.double().T)[:, :2] / local[:, 2:].clamp_min(1e-6)
-    positions = 2.0 * pixels / pixels.new_tensor([camera.width, camera.height]) - 1.0
+    height, width = image.shape
+    positions = 2.0 * pixels / (_block(camera) * pixels.new_tensor([width, height])) - 1.0
     inside = (ahead & (positions.abs() < 1.0).all(1)).view(points.shape[:3]).all(2)
     values = functional.grid_sample(image[None, None], positions[None, None], align_corners=False)[0, 0, 0]
     correlation = (_standard(values.view(points.shape[:3])) * own[:, None]).sum(2)

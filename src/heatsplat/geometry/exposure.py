@@ -18,11 +18,13 @@ APART = math.radians(1.25)  # of directions of the sun: five minutes of its way
 def sun_directions(sun: Tensor, up: Tensor) -> Tensor:
     """Directions [D, 3] such that each that the sun [T, 3] has above the horizon [up: 3] is within 1.25 degrees of one; up alone
     where it never rises."""
-    found: list[Tensor] = []
-    for direction in sun[sun @ up.to(sun) > 0]:
-        if not found or float((torch.stack(found) @ direction).max()) < math.cos(APART):
-            found.append(direction)
-    return torch.stack(found) if found else up.to(sun)[None]
+    risen = sun[sun @ up.to(sun) > 0]
+    found, count = torch.empty_like(risen), 0
+    for direction in risen:
+        if not count or float((found[:count] @ direction).max()) < math.cos(APART):
+            found[count] = direction
+            count += 1
+    return found[:count].clone() if count else up.to(sun)[None]
 
 
 def sky_directions(count: int, up: Tensor) -> Tensor:

@@ -154,9 +154,16 @@ class Images(Teacher):
         if not self.files:
             raise SceneError(f"teacher={folder}: the folder holds no image ({', '.join(SUFFIXES)}). {WHERE}")
         self.description = f"images in {folder.name}/"
+        self._served: dict[Path, str] = {}  # file -> the training image that it is of
 
     def check(self, frame: Frame, factor: int) -> None:
         path = self._file_of(frame)
+        other = self._served.setdefault(path, frame.name)
+        if other != frame.name:
+            raise SceneError(
+                f"teacher image {path} would be that of {other} and of {frame.name}: put enlarged images into folders of the "
+                "same names as the training images'"
+            )
         with _opened(path) as image:
             self._check_size(path, image.size, frame, factor)
 

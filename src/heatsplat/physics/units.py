@@ -11,6 +11,8 @@ DAY_S = 86400.0
 CENTIKELVIN = 0.01  # kelvin per count of cameras that store kelvin x 100 (Lepton's TLinear, Boson's radiometric video)
 # Counts whose median and whose bulk lie so are taken for kelvin x 100.
 USUAL_MEDIAN_C, USUAL_SPAN_K = (-40.0, 100.0), 200.0
+# Numbers in this range may be kelvin of -73 .. 127 °C or °C of a furnace; nothing tells.
+MAYBE_KELVIN = (200.0, 400.0)
 STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m² K⁴), CODATA 2018
 
 

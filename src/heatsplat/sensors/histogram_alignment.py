@@ -44,7 +44,8 @@ class HistogramAlignment(PerFrame):
         shares = torch.linspace(0.0, 1.0, self.count)
         found = {}
         for view in scene.train:
-            values = view.thermal[view.mask] if view.mask is not None else view.thermal
+            values = view.image("thermal")
+            values = values if view.mask is None else values[view.mask]
             unknown = not values.numel()  # its mask leaves none: the shared histogram stands for its own
             found[view.frame.frame_id] = shares * torch.nan if unknown else values.flatten().float().quantile(shares)
         rows = torch.stack([found[int(frame_id)] for frame_id in self.frame_ids])

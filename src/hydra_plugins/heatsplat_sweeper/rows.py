@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn
 from hydra.plugins.launcher import Launcher
@@ -156,7 +157,9 @@ class RowSweeper(BasicSweeper):
             from heatsplat.studies.leaderboard.sweep import Leaderboard
 
             asked = OmegaConf.to_container(self.config.leaderboard, resolve=True)
-            return Leaderboard(board_of(asked, self._methods(), keys_of(arguments)))
+            overrides = OverridesParser.create().parse_overrides([*arguments])
+            several = {one.key_or_group for one in overrides if one.is_sweep_override()}
+            return Leaderboard(board_of(asked, self._methods(), keys_of(arguments), several))
         if self.knobs is not None:
             from heatsplat.studies.knobs import Knobs
 

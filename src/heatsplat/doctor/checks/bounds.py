@@ -5,13 +5,12 @@ from __future__ import annotations
 import torch
 
 from heatsplat.doctor.base import Check, Finding, Material
-from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, is_centikelvin
+from heatsplat.physics.units import CENTIKELVIN, KELVIN_AT_0_C, MAYBE_KELVIN, is_centikelvin
 
 CLIPPED = 0.005  # share of pixels beyond the bounds
 MIDDLE = (0.001, 0.999)  # quantiles: what lies beyond may be a few faulty pixels
 NARROW = 0.15  # of the range that pixels use
 EARTHLY_C = (-60.0, 650.0)  # what cameras measure without a special range
-KELVIN_C = (200.0, 400.0)  # "°C" between which a whole scene is rather one of -73 .. 127 °C in kelvin
 MAX_VALUES = 1 << 23  # torch takes no quantiles of twice as many
 FULL_16_BIT = 65535
 PLATEAU = 0.004  # share of an image's pixels at exactly its largest value
@@ -99,7 +98,7 @@ def _of_unit(material: Material, values: torch.Tensor) -> list[Finding]:
     given = material.bounds_c is not None and not material.bounds_chosen
     low, high = material.bounds_c if given else _celsius(material, values)
     remedy = _unit_remedy(material)
-    if KELVIN_C[0] <= low and high <= KELVIN_C[1]:
+    if MAYBE_KELVIN[0] <= low and high <= MAYBE_KELVIN[1]:
         kelvin = f"kelvin of {low - KELVIN_AT_0_C:.4g} .. {high - KELVIN_AT_0_C:.4g} °C"
         what = f"All pixels lie within {low:.4g} .. {high:.4g} °C, which may be {kelvin}."
         return [Finding("bounds", 0.9, what, remedy)]

@@ -147,7 +147,9 @@ class Board:
         return f"{what}: {len(self.jobs())} runs; scenes in {self.root}"
 
 
-def board_of(asked: Mapping[str, Any], known: Iterable[str], given: Collection[str] = ()) -> Board:
+def board_of(
+    asked: Mapping[str, Any], known: Iterable[str], given: Collection[str] = (), several: Collection[str] = ()
+) -> Board:
     """The board that a configuration asks for (conf/experiment/leaderboard.yaml).
 
     Submissions are scored here and the earlier page is read: what is wrong with them is told before anything runs.
@@ -156,16 +158,22 @@ def board_of(asked: Mapping[str, Any], known: Iterable[str], given: Collection[s
         asked: its section "leaderboard".
         known: options of conf/method.
         given: keys that the command line sets.
+        several: those of them that it gives several values.
 
     Raises:
-        SceneError: no folder of scenes, names that there are not, or a key that the board decides; a submission is none, or
-            has the name of a method or an unknown track; the page is not one of this board.
+        SceneError: no folder of scenes, names that there are not, a key that the board decides, or several values of another; a
+            submission is none, or has the name of a method or an unknown track; the page is not one of this board.
     """
     for key, instead in DECIDED.items():
         if key in given:
             raise SceneError(
                 f"{key}=...: a leaderboard has several; choose among them with leaderboard.{instead}=[...]"
             )
+    if several:
+        raise SceneError(
+            f"{', '.join(sorted(several))}: a leaderboard has one run of each method, scene, track and seed, so that of several "
+            "values one would count; give one, and the others to leaderboards in other folders (lists in brackets: [a,b])"
+        )
     protocol = asked["protocol"]
     if asked["root"] is None:
         raise SceneError(

@@ -29,16 +29,20 @@ TIES = "methods are tied and share ranks if they differ by less than two standar
 
 
 def write_leaderboard(folder: Path, board: Board) -> list[Path]:
-    """Writes the table, the CSV and the page into the folder of a sweep, and where the board says besides; their paths."""
+    """Writes the table, the CSV and the page into the folder of a sweep, and where the board says besides; their paths.
+
+    What stands there besides stays where nothing has results, as of a command that failed or names another folder.
+    """
     found = standings(folder, board)
     told = summary(found.entries, board)
     log.info("%d of %d entries have results, of %d runs", told["filled"], told["entries"], told["runs"])
     text = markdown(found, board)
     files = {folder / TABLE_FILE: text, folder / PAGE_FILE: page(found, board, folder)}
-    if board.document is not None:
-        files[board.document] = text
-    if board.page is not None:
-        files[board.page] = page(found, board, None)
+    if told["runs"]:
+        files |= {board.document: text} if board.document is not None else {}
+        files |= {board.page: page(found, board, None)} if board.page is not None else {}
+    elif board.document or board.page:
+        log.warning("there is no result in %s: leaderboard.document and leaderboard.page are left as they are", folder)
     for path, content in files.items():
         write_atomically(path, content)
     write_csv(folder / CSV_FILE, _records(found.entries, board))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import re
@@ -19,7 +20,7 @@ from heatsplat.studies.finished import reason_of
 from heatsplat.studies.leaderboard.earlier import EarlierSeeds, Place, add_earlier, sentence
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.recorded import OVERRIDES, overrides_of
-from heatsplat.studies.score import COSTS, SCENES, TRUTH, SceneScore, score_scene
+from heatsplat.studies.score import COSTS, META, SCENES, TRUTH, SceneScore, score_scene
 
 SCORE_FILE, SUBMISSION = "score.json", "submission"
 WIDTH = 2.0  # standard errors of a difference below which two methods are tied
@@ -227,14 +228,16 @@ def _of_the_board(name: str) -> bool:
 
 
 def scored_once(folder: Path, scene: str, board: Board) -> SceneScore:
-    """The score of the renders of a run, which is written beside them and taken from there the next time."""
+    """The score of the renders of a run, which is written beside them and taken from there the next time, unless the run was made
+    anew since, or the scene with other settings (``meta.json``)."""
     path, metrics = folder / SCORE_FILE, folder / METRICS_FILE
+    made = hashlib.sha256((board.root / SCENES / scene / META).read_bytes()).hexdigest()
     if path.exists() and path.stat().st_mtime >= metrics.stat().st_mtime:
         known = json.loads(path.read_text(encoding="utf-8"))
-        if known["scores"] == board.scores:
+        if known["scores"] == board.scores and known.get("scene", made) == made:
             return SceneScore(known["views"])
     score = score_scene(folder / SUBMISSION, board.root / SCENES / scene, board.root / TRUTH / scene, board.scores)
-    write_atomically(path, json.dumps({"scores": board.scores, "views": score.views}))
+    write_atomically(path, json.dumps({"scores": board.scores, "scene": made, "views": score.views}))
     return score
 
 
