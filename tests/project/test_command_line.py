@@ -75,7 +75,7 @@ def finished(tmp_path_factory) -> Path:
     """Folder of a finished tiny run, trained from another working directory."""
     folder = tmp_path_factory.mktemp("cli")
     output = command("train", "method=etgs", *TINY, f"hydra.run.dir={folder}/run", cwd=folder)
-    assert "psnr" in output and "train_seconds" in output and ".png" in output
+    assert "PSNR" in output and "training" in output and ".png" in output
     return folder / "run"
 
 
@@ -338,6 +338,11 @@ def test_a_command_without_arguments_shows_how_it_is_used_and_trains_nothing(tmp
 def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path, told):
     output = told("train", "seed=1", wrong, cwd=tmp_path, code=1)
     assert meant in output and "Traceback" not in output
+
+
+def test_a_setting_of_another_command_is_not_offered_to_be_added(tmp_path, told):
+    said = told("view", f"ckpt={tmp_path}/none.ckpt", "trajectory=orbit", cwd=tmp_path, code=1)
+    assert "view has no such setting; --help lists those that it has" in said and "+trajectory" not in said
 
 
 def test_a_typing_error_ends_a_process_with_its_sentence_and_exit_code_one(tmp_path):
