@@ -80,7 +80,7 @@ def test_a_budget_is_told_once_and_without_what_is_empty(tmp_path):
         "twice": "twice the time (10 s) would buy about +2.68 dB: 2,004 steps", "notes": [],
     }  # fmt: skip
     text = markdown(RunResults(run={"method": "etgs", "budget": budget}), tmp_path, [], None)
-    told = "asked for 5 s, missed by 1.47 percent, moved at step –, twice the time (10 s) would buy about +2.68 dB: 2,004 steps"
+    told = f"asked for 5 s, missed by 1.47 percent, moved at step –, by the plan {budget['twice']}"
     assert f"- time that was given (`budget`): {told}\n" in text
 
 

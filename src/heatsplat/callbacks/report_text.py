@@ -15,6 +15,7 @@ from heatsplat.callbacks.probes import PROBES_PICTURE
 from heatsplat.callbacks.report_words import COST_WORDS, DATA_WORDS, EFFECT_WORDS, RUN_WORDS, SETTING_WORDS, Words
 from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
 from heatsplat.callbacks.turntable import TURNTABLE_FILE
+from heatsplat.contracts import rounded
 from heatsplat.io.citations import citations
 from heatsplat.io.page import plain
 from heatsplat.io.quantities import CLOCKS, Clock, moment, words_and_unit
@@ -201,7 +202,7 @@ def _place(effect: Mapping[str, Any]) -> tuple[bool, bool]:
 
 def _effects_row(name: str, effect: Mapping[str, Any]) -> tuple[str, ...]:
     statistic, threshold, parameters, milliseconds = (
-        NONE if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else f"{effect[key]:.3g}"
+        NONE if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else rounded(effect[key], 3)
         for key in ("statistic", "threshold", "parameters", "ms_per_step")
     )
     sure = "**yes**" if effect["on"] else "no"
@@ -281,7 +282,7 @@ def _in_words(name: str, value: Any, known: Words) -> tuple[str, str]:
         if name == "views":
             return words, ", ".join(f"{_words(count)} {PARTS.get(part, part)}" for part, count in value.items())
         told = (item for item in value.items() if TWICE.get(item[0]) not in value and item[1] not in ("", []))
-        return words, ", ".join(" ".join(_in_words(*item, known)).lstrip() for item in told) or "on"
+        return words, ", ".join(" ".join(_in_words(*item, known)) for item in told) or "on"
     values = value if isinstance(value, list | tuple) else [value]
     numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
     if name in CLOCKS and numbers:

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-# name -> (words, unit); "" for no unit, "%" for a share from 0 to 1; no words where the value is a sentence
-Words = Mapping[str, tuple[str, str]]
+Words = Mapping[str, tuple[str, str]]  # name -> (words, unit); "" for no unit, "%" for a share from 0 to 1
 
 COST_WORDS: Words = {
     "choosing_seconds": ("choosing effects", "s"),
@@ -92,7 +91,7 @@ RUN_WORDS: Words = {
     "expected_psnr_on_demo_scenes": ("PSNR to expect on demo scenes", "dB"),
     "twice_gain_db": ("gain of twice the time", "dB"),
     "twice_steps": ("steps in twice the time", ""),
-    "twice": ("", ""),
+    "twice": ("by the plan", ""),
 }
 
 # Physical effects, as headings.
