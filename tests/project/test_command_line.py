@@ -350,6 +350,15 @@ def test_a_typing_error_ends_a_process_with_its_sentence_and_exit_code_one(tmp_p
     assert "Did you mean method=etgs" in output and "Traceback" not in output
 
 
+def test_ctrl_c_before_training_ends_with_a_sentence(monkeypatch, tmp_path, told):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("heatsplat.runs.run.train_in", interrupted)
+    said = told("train", *TINY, f"hydra.run.dir={tmp_path}/run", cwd=tmp_path, code=130)
+    assert "Interrupted." in said
+
+
 def test_a_group_set_to_null_is_told_its_options(tmp_path, told):
     output = told("train", "method=etgs", "logger=null", cwd=tmp_path, code=1)
     assert "logger=null" in output and "none, tensorboard" in output and "Traceback" not in output
