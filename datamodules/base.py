@@ -139,7 +139,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
             SceneError: no root, or no such scene; the message lists the scenes that are there.
         """
         if not self.root:
-            raise SceneError("data.root is not set; give the folder of the data set, e.g. data.root=/data/rhd")
+            raise SceneError("data.root is not set; give the folder of the data set, as in data.root=/data/my_scenes")
         root = Path(self.root).expanduser().absolute()
         if not root.is_dir():
             near = next(p for p in root.parents if p.is_dir())

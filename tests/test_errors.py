@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from heatsplat.errors import SceneError, check_count, check_numbers, check_option
+from heatsplat.errors import SceneError, check_count, check_numbers, check_option, rounded
 
 
 def test_an_option_that_there_is_not_is_told_those_that_there_are():
@@ -41,3 +41,10 @@ def test_what_counts_nothing_is_named(wrong):
         check_count("study.trials", wrong)
     check_count("study.trials", 1)
     check_count("study.seeds", 0, least=0)
+
+
+def test_large_numbers_of_messages_have_no_powers_of_ten():
+    assert [rounded(value, 2) for value in (0.0512, 9.96, 49.4, 130.2, -1_234_567.0, math.inf)] == [
+        "0.051", "10", "49", "130", "-1,200,000", "inf",
+    ]  # fmt: skip
+    assert rounded(99.7, 2) == "100" and rounded(999.7, 3) == "1,000"

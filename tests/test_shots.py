@@ -110,7 +110,7 @@ def test_a_figure_names_the_view_its_moment_and_the_clock(tmp_path):
     write_shot(images, frames, scene, files, range_c=[-5.0, 5.0], titles=titles)
     (figure,) = tmp_path.glob("figures/*.svg")
     svg = figure.read_text()
-    assert "0_0000   60.0 min (2024-08-06 18:34 UTC)" in svg
+    assert "60.0 min (2024-08-06 18:34 UTC)   0_0000" in svg
     assert "render · 100 % above 5 °C" in svg
 
 
@@ -124,6 +124,18 @@ def test_pictures_of_greys_without_temperatures_say_so_at_their_bar(tmp_path, mo
         write_shot([({"recorded": image}, None)], frames, scene, ShotFiles(tmp_path, video=False), range_c=ends)
     assert [panel.bar.unit for panel in shown] == ["image value"] * 2
     assert shown[1].title.endswith("100 % below 10 image value")
+
+
+def test_the_time_stands_before_a_name_that_narrow_pictures_cut(tmp_path, monkeypatch):
+    scene = make_scene()
+    (frame,) = shot_frames(scene, "view", scene.train.times_s[0], 0, 1)
+    titles: list[str] = []
+    monkeypatch.setattr(ShotFiles, "add_picture", lambda self, suffix, stem, panel, title, **_: titles.append(title))
+    size = frame.camera.height, frame.camera.width
+    images = [({"recorded": torch.full((*size, 1), 0.5)}, None)]
+    write_shot(images, [frame], scene, ShotFiles(tmp_path, video=False))
+    (told,) = titles
+    assert re.fullmatch(rf"-?\d+\.\d s.*   {frame.name.partition('.')[0]}\S*", told)
 
 
 def test_limits_stand_before_the_title_which_narrow_panels_cut(tmp_path, monkeypatch):

@@ -111,6 +111,11 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
         except BrokenPipeError:  # as of --help | head
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has no reader
             sys.exit(128 + signal.SIGPIPE)
+        except KeyboardInterrupt:  # where no checkpoint can be written yet, or any more
+            if all_of_it:
+                raise
+            print("Interrupted.", file=sys.stderr)
+            sys.exit(128 + signal.SIGINT)
         except Exception as error:  # of Hydra, or of a job of a sweep, when all others have run
             told = None if all_of_it else explain(error, name, sys.argv[1:])
             if told is None:

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 # Also under this name, for packages that need torch anyway; what must start without it imports heatsplat.errors.
-from heatsplat.errors import SceneError, check_count, check_numbers, check_option, counted, is_number  # noqa: F401
+from heatsplat.errors import SceneError, check_count, check_numbers, check_option, counted, is_number, rounded  # noqa: F401
 
 SHARE_OF_RANGE = "share of the image's range"  # unit of a course in image units
 

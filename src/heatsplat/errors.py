@@ -47,6 +47,12 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
+def rounded(value: float, digits: int) -> str:
+    """A number for messages, of so many significant digits, without powers of ten where it is large: "130", not "1.3e+02"."""
+    short = f"{value:.{digits}g}"
+    return f"{float(short):,.0f}" if abs(float(short)) >= 10**digits else short
+
+
 def is_number(value: Any) -> bool:
     """Whether a setting is a finite number: neither text nor true or false."""
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)

@@ -163,7 +163,8 @@ def _of_unknown_key(wrong: str, command: str, arguments: Sequence[str]) -> str:
         return f"{parent} has nothing to set{chosen}: leave {wrong} out"
     if not near and parent in keys:
         return f"{parent} has {', '.join(sorted(beside))}"
-    return _did_you_mean(near or difflib.get_close_matches(wrong, keys, 3))
+    meant = _did_you_mean(near or difflib.get_close_matches(wrong, keys, 3))
+    return meant or ("" if parent else f"{command} has no such setting; --help lists those that it has")
 
 
 def _of_dotted_name(settings: dict[str, Any], wrong: str, arguments: Sequence[str]) -> str:

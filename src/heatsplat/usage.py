@@ -51,7 +51,10 @@ def usage(command: str, doc: str, arguments: Sequence[str] = ()) -> str:
     for group, options in choices.items():
         if options:
             lines += textwrap.wrap(f"  {group}: {', '.join(options)}", WIDTH, subsequent_indent="    ")
-    lines += ["", "With --cfg job: all settings and their values, as what stands beside it sets them."]
+    lines += [
+        "",
+        "With --cfg job, a command lists all its settings with the values that they would have, and runs nothing.",
+    ]
     return re.sub("\n{3,}", "\n\n", "\n".join(lines))
 
 

@@ -342,6 +342,10 @@ def test_progress_says_how_far_it_is(tmp_path, capsys):
     curve = read_csv(tmp_path / "curve.csv")
     for row in curve:
         assert f"step {row['step']:.0f}:  PSNR {row['psnr']:.2f} dB" in said
+        after = said[said.index(f"step {row['step']:.0f}:") :].split("\n")[
+            1
+        ]  # the line is drawn again, with the step reached
+        assert f"{row['step']:.0f}/8" in after
     quiet = FakeModule(wall(), tmp_path)
     fit(quiet, trainer(tmp_path, [Progress(enabled=False)], steps=4, every=4))
     assert "/4" not in capsys.readouterr().err

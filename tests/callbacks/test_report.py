@@ -149,8 +149,8 @@ def test_report_is_whole(run):
     for path in [*pictures, *re.findall(r"[^!]\[[^\]]*\]\(([^)]+)\)", text)]:
         assert (folder / path).is_file(), path
     test = RunResults.read(folder / "metrics.json").test
-    assert f"| psnr | {test['psnr']:.4g} dB |" in text
-    assert "| lpips | – |" in text and "`test.lpips`: LPIPS(alex) needs" in text
+    assert f"| PSNR (`psnr`) | {test['psnr']:.4g} dB |" in text
+    assert "| LPIPS (`lpips`) | – |" in text and "`test.lpips`: LPIPS(alex) needs" in text
     assert "timestamps: from file names" in text
     assert "newton cooling (`newton_cooling`): temperature of the surroundings learned" in text
     assert text.startswith("# etgs on wall")

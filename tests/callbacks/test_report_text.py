@@ -5,11 +5,13 @@ import html
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from heatsplat.callbacks.report import show
 from heatsplat.callbacks.report_text import _picture, cells, data_lines, effects_table, markdown
 from heatsplat.io.page import page
 from heatsplat.io.results import RunResults
+from heatsplat.metrics.definitions import COSTS, DEFINITIONS
 
 
 def test_names_are_shown_as_they_are(tmp_path, capsys):
@@ -28,9 +30,58 @@ def test_names_are_shown_as_they_are(tmp_path, capsys):
 
 
 def test_a_score_of_an_own_callback_has_the_unit_of_its_definition():
-    definitions = {"rmse_c": "°C, lower is better: root", "sharpness": "higher is better: of edges"}
-    content = {"test": {"rmse_c": 3.907, "sharpness": 0.5, "psnr": 20.0, "other": None}, "definitions": definitions}
-    assert cells(content, "test") == [("rmse_c", "3.907 °C"), ("sharpness", "0.5"), ("psnr", "20 dB"), ("other", "–")]
+    definitions = {
+        "error": "K, lower is better: root",
+        "sharpness": "higher is better: of edges",
+        "deviation_c": "°C: median",
+    }
+    test = {"error": 3.907, "sharpness": 0.5, "deviation_c": 0.25, "psnr": 20.0, "other": None}
+    assert [(name, value) for name, _, value in cells({"test": test, "definitions": definitions}, "test")] == [
+        ("error", "3.907 K"), ("sharpness", "0.5"), ("deviation_c", "0.25 °C"), ("psnr", "20 dB"), ("other", "–"),
+    ]  # fmt: skip
+
+
+def test_scores_and_costs_are_told_in_words_beside_their_names(tmp_path, capsys):
+    results = RunResults(run={"method": "etgs", "scene": "a"})
+    results.test = {"mae_c": 0.5, "clean_psnr": 31.25, "own_score_c": 2.0}
+    results.cost = {"train_seconds": 12.5, "steps_per_second": 40.0, "peak_memory_mb": 512.5}
+    results.definitions = {"mae_c": "°C, lower is better: mean", "scored": "the image", "scene_threshold_c": 32.5}
+    text = markdown(results, tmp_path, [], None)
+    for row in ("MAE (`mae_c`) | 0.5 °C", "clean PSNR (`clean_psnr`) | 31.25 dB", "own score (`own_score_c`) | 2 °C"):
+        assert f"| {row} |" in text
+    for row in (
+        "training (`train_seconds`) | 12.5 s",
+        "steps per second (`steps_per_second`) | 40",
+        "(`peak_memory_mb`) | 512.5 MB",
+    ):
+        assert f"{row} |" in text
+    told = text[text.index("## Definitions") :].split("\n\n")[1].splitlines()
+    assert told == [
+        "- MAE (`mae_c`): °C, lower is better: mean",
+        "- scored: the image",
+        "- scene threshold (`scene_threshold_c`): 32.5 °C",
+    ]
+    show(results, tmp_path, None)
+    said = capsys.readouterr().out
+    assert "│ MAE " in said and "│ training " in said and "mae_c" not in said and "train_seconds" not in said
+
+
+def test_the_table_of_all_scores_fits_a_terminal_of_80_columns(tmp_path, capsys):
+    results = RunResults(run={"method": "etgs", "scene": "a"})
+    results.test, results.cost = dict.fromkeys(DEFINITIONS, 12.3456), dict.fromkeys(COSTS, 123.456)
+    show(results, tmp_path, None, Console(width=80))
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    assert len(rows) == len(COSTS)  # none is broken
+
+
+def test_a_budget_is_told_once_and_without_what_is_empty(tmp_path):
+    budget = {
+        "asked_s": 5.0, "off_percent": 1.47, "settings": [], "moved_at_step": None, "twice_gain_db": 2.68, "twice_steps": 2004,
+        "twice": "twice the time (10 s) would buy about +2.68 dB: 2,004 steps", "notes": [],
+    }  # fmt: skip
+    text = markdown(RunResults(run={"method": "etgs", "budget": budget}), tmp_path, [], None)
+    told = f"asked for 5 s, missed by 1.47 percent, moved at step –, by the plan {budget['twice']}"
+    assert f"- time that was given (`budget`): {told}\n" in text
 
 
 @pytest.mark.parametrize("name", ["IMG (1).png", "Bild#1 50%ü_[x].png", "a*b_c_`d`.png", "<b>.png"])

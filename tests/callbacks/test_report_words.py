@@ -3,8 +3,9 @@
 import pytest
 from helpers import ROOT
 
-from heatsplat.callbacks.report_words import EFFECT_WORDS, RUN_WORDS, SETTING_WORDS
+from heatsplat.callbacks.report_words import COST_WORDS, EFFECT_WORDS, RUN_WORDS, SETTING_WORDS
 from heatsplat.effects.catalogue import CATALOGUE
+from heatsplat.metrics.definitions import COSTS
 
 SOURCES = {
     folder: "\n".join(
@@ -17,6 +18,10 @@ SOURCES = {
 def test_every_effect_of_the_catalogue_has_words_of_its_own():
     assert set(EFFECT_WORDS) == {effect.name for effect in CATALOGUE}
     assert len(set(EFFECT_WORDS.values())) == len(EFFECT_WORDS)
+
+
+def test_every_cost_has_words_of_its_own():
+    assert set(COST_WORDS) == set(COSTS) and len(set(COST_WORDS.values())) == len(COSTS)
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def finished(tmp_path_factory) -> Path:
     """Folder of a finished tiny run, trained from another working directory."""
     folder = tmp_path_factory.mktemp("cli")
     output = command("train", "method=etgs", *TINY, f"hydra.run.dir={folder}/run", cwd=folder)
-    assert "psnr" in output and "train_seconds" in output and ".png" in output
+    assert "PSNR" in output and "training" in output and ".png" in output
     return folder / "run"
 
 
@@ -340,9 +340,23 @@ def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path, told):
     assert meant in output and "Traceback" not in output
 
 
+def test_a_setting_of_another_command_is_not_offered_to_be_added(tmp_path, told):
+    said = told("view", f"ckpt={tmp_path}/none.ckpt", "trajectory=orbit", cwd=tmp_path, code=1)
+    assert "view has no such setting; --help lists those that it has" in said and "+trajectory" not in said
+
+
 def test_a_typing_error_ends_a_process_with_its_sentence_and_exit_code_one(tmp_path):
     output = command("train", "seed=1", "method=etsg", cwd=tmp_path, code=1)
     assert "Did you mean method=etgs" in output and "Traceback" not in output
+
+
+def test_ctrl_c_before_training_ends_with_a_sentence(monkeypatch, tmp_path, told):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("heatsplat.runs.run.train_in", interrupted)
+    said = told("train", *TINY, f"hydra.run.dir={tmp_path}/run", cwd=tmp_path, code=130)
+    assert "Interrupted." in said
 
 
 def test_a_group_set_to_null_is_told_its_options(tmp_path, told):

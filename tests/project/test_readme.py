@@ -120,7 +120,7 @@ def ended(data, tmp_path_factory) -> dict[str, tuple[Done, Path]]:
 def check_done(command: str, done: Done, folder: Path) -> None:
     assert done.returncode == 0, done.output
     if "train.py" in command or "evaluate.py" in command:
-        assert "psnr" in done.output
+        assert "PSNR" in done.output
         jobs = {" -m ": 3, "ablation=": 5, "experiment=": 2}
         expected = next((count for word, count in jobs.items() if word in command), 1)
         assert len(list(folder.rglob("metrics.json"))) == expected
@@ -165,7 +165,7 @@ def test_make_demo_runs():
     if not ready.exists():
         pytest.skip("the environment was not set up by make install")
     output = shell(["make", "demo", f"ARGS={' '.join(SHORT)}"], ROOT)
-    assert "psnr" in output and "picture" in output
+    assert "PSNR" in output and "picture" in output
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")

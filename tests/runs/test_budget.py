@@ -647,7 +647,7 @@ def test_a_run_ends_in_its_time_and_says_what_twice_would_buy(tmp_path):
     assert told["calibration_s"] < 1.0 and told["steps"] == module.trainer.global_step
     assert plain["density"]["stop"] == round(0.48 * plain["max_steps"])  # the schedule is that of the planned steps
     report = (tmp_path / "report.md").read_text()
-    assert "twice the time (12 s) would buy" in report and "twice_gain_db" in report
+    assert "twice the time (12 s) would buy" in report and told["twice_gain_db"] >= 0
     assert (tmp_path / "checkpoints" / "last.ckpt").exists()
 
 

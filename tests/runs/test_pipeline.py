@@ -117,6 +117,8 @@ def test_results_of_other_settings_are_not_taken_for_those_of_this_run(trained):
     folder, config, _ = trained
     with pytest.raises(OccupiedError, match=r"other settings \(data.seed, seed\)"):
         heatsplat.train(heatsplat.compose([*QUICK, "seed=7"]), folder)
+    with pytest.raises(OccupiedError, match=r"other settings \([^,]+(, [^,]+){4} and \d+ more\): give another folder"):
+        heatsplat.train(heatsplat.compose([*QUICK, "method=energy_balance"]), folder)
 
 
 @pytest.mark.parametrize(

@@ -258,7 +258,7 @@ def test_where_no_run_can_be_read_the_folder_and_the_remedy_are_named(tmp_path):
     content = json.loads((tmp_path / "old" / METRICS_FILE).read_text())
     del content["effects"]
     (tmp_path / "old" / METRICS_FILE).write_text(json.dumps(content))
-    with pytest.raises(SceneError, match=rf"runs={tmp_path}: there is no finished run .* must be trained again"):
+    with pytest.raises(SceneError, match=rf"study.runs={tmp_path}: there is no finished run .* must be trained again"):
         run(tmp_path / "out", str(tmp_path), **LEVELS)
 
 

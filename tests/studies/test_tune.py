@@ -120,6 +120,7 @@ def test_the_report_says_what_all_runs_have_and_with_which_seeds_they_are_compar
     tune.run(tmp_path, CASES, trials=2, seeds=[3, 1], overrides=["data.downscale=2", "threads=1"])
     text = (tmp_path / "tune.md").read_text()
     assert "All rows: `data.downscale=2 threads=1`." in text and "beside the default, seeds 3, 1\n" in text
+    assert "| gain in PSNR (dB) | verdict |" in text
 
 
 def test_a_best_setting_that_fails_on_another_seed_is_told(world, tmp_path):

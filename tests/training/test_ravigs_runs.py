@@ -38,7 +38,7 @@ def test_both_images_are_scored(finished):
     assert found["test"]["rgb_psnr"] == pytest.approx(sum(row["rgb_psnr"] for row in rows) / len(rows))
     assert [row["step"] for row in read_csv(folder / "curve.csv")] == [6, 12]
     assert read_csv(folder / "curve.csv")[1]["rgb_psnr"] > 5
-    assert f"| rgb_psnr | {found['test']['rgb_psnr']:.4g} dB |" in (folder / "report.md").read_text()
+    assert f"| RGB PSNR (`rgb_psnr`) | {found['test']['rgb_psnr']:.4g} dB |" in (folder / "report.md").read_text()
 
 
 def test_both_images_and_the_attributes_are_drawn(finished):

@@ -9,6 +9,7 @@ import torch
 from running import TINY, run
 
 from heatsplat.contracts import SceneError
+from heatsplat.runs.signals import stoppable
 from heatsplat.training.checkpoints import load_checkpoint
 
 SHORT = (
@@ -56,7 +57,8 @@ def test_a_run_leaves_metrics_beside_their_cost(tmp_path):
     assert (tmp_path / "report.md").exists()
 
 
-def test_interruption_leaves_a_checkpoint_that_resumes(tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGUSR2"])
+def test_interruption_leaves_a_checkpoint_that_resumes(name, tmp_path, monkeypatch):
     import heatsplat.training.session as session
 
     steps, listen = [], session.StopOnInterrupt.on_train_batch_end
@@ -64,14 +66,15 @@ def test_interruption_leaves_a_checkpoint_that_resumes(tmp_path, monkeypatch):
     def interrupt_at_seven(self, trainer, *rest):
         steps.append(trainer.global_step)
         if trainer.global_step == 7:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.Signals[name])
         listen(self, trainer, *rest)
 
     monkeypatch.setattr(session.StopOnInterrupt, "on_train_batch_end", interrupt_at_seven)
     brief = ("max_steps=12", "trainer.limit_val_batches=0", "callbacks.costs=null", "logger=none")
-    with pytest.raises(SystemExit) as stopped:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as stopped, stoppable():
         run(tmp_path, *SHORT, *brief, "method=3dgs")
-    assert stopped.value.code == 130
+    assert stopped.value.code == 130 and signal.getsignal(signal.SIGTERM) == before
     last = tmp_path / "checkpoints" / "last.ckpt"
     assert load_checkpoint(last)["global_step"] == 7 == steps[-1]
     often = "callbacks.checkpoint.every_n_train_steps=5"  # to Lightning another callback

@@ -140,7 +140,7 @@ class BudgetClock(pl.Callback):
         }
         module.results.run["budget"] = found
         log.info(
-            "budget: %.1f s of %g s (%+.1f %%), %d steps of %d planned; %s",
+            "budget: %.1f s of %g s (%+.1f %%), %d steps of %d planned; by the plan, %s",
             whole, self.plan["asked_s"], found["off_percent"], trainer.global_step, self.plan["steps"], self.twice,
         )  # fmt: skip
         if done < 0.95:

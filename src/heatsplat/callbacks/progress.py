@@ -66,6 +66,7 @@ class Progress(pl.Callback):
         seconds = module.results.cost.get("train_seconds")
         if seconds is not None:
             words.append(f"after {seconds:.{0 if seconds >= 10 else 1}f} s")
+        self._draw(trainer.global_step, module)  # what stands below the scores must not be older than they are
         self._bar.write("  ".join(words), file=sys.stderr)
 
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:

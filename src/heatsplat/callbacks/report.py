@@ -125,7 +125,7 @@ def show(results: RunResults, folder: Path, picture: Path | None, console: Conso
     table = Table(title=f"{run.get('method') or run.get('thermal_model')} on {run.get('scene')}", title_justify="left")
     for column, justify in (("score", "left"), ("", "right"), ("cost", "left"), (" ", "right")):
         table.add_column(column, justify=justify)
-    for score, cost in zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("", "")):
+    for (_, *score), (_, *cost) in zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("",) * 3):
         table.add_row(*score, *cost)
     console.print(table)
     console.print(f"machine: {run.get('machine')}; threads: {run.get('threads')}", soft_wrap=True)

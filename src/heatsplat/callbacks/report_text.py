@@ -12,15 +12,16 @@ from heatsplat.callbacks.attributes import LEARNED_FILE
 from heatsplat.callbacks.courses import COURSES_PICTURE
 from heatsplat.callbacks.metrics import TEST_FILE
 from heatsplat.callbacks.probes import PROBES_PICTURE
-from heatsplat.callbacks.report_words import DATA_WORDS, EFFECT_WORDS, RUN_WORDS, SETTING_WORDS, Words
+from heatsplat.callbacks.report_words import COST_WORDS, DATA_WORDS, EFFECT_WORDS, RUN_WORDS, SETTING_WORDS, Words
 from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
 from heatsplat.callbacks.turntable import TURNTABLE_FILE
+from heatsplat.contracts import rounded
 from heatsplat.io.citations import citations
 from heatsplat.io.page import plain
 from heatsplat.io.quantities import CLOCKS, Clock, moment, words_and_unit
 from heatsplat.io.results import CURVE_FILE, RunResults
 from heatsplat.io.tables import NONE, markdown_table, read_csv
-from heatsplat.metrics.definitions import described, unit_of
+from heatsplat.metrics.definitions import Definition, described, unit_of
 from heatsplat.viewer.page import FILE as VIEWER_FILE
 
 DEFINITIONS_TITLE = "Definitions of the scores"
@@ -37,6 +38,8 @@ TWICE = {
     "train_views": "views",
     "test_views": "views",
     "duration_s": "seconds",
+    "twice_gain_db": "twice",
+    "twice_steps": "twice",
 }  # told by the other name, where that is there
 PARTS = {"train": "to train", "val": "to validate", "test": "to test"}
 
@@ -49,7 +52,10 @@ def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves
     content = results.as_json()
     run, reasons = content["run"], content["reasons"]
     lines = [f"# {run.get('method') or run.get('thermal_model')} on {plain(str(run.get('scene')))}", ""]
-    pairs = zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("", ""))
+    told = (
+        [(_labelled(words, name), value) for name, words, value in cells(content, part)] for part in ("test", "cost")
+    )
+    pairs = zip_longest(*told, fillvalue=("", ""))
     table = markdown_table(("score", "value", "", "cost", "value"), [(*score, "", *cost) for score, cost in pairs])
     lines += ["## Scores and cost", "", *table, "", f"What each score is stands below, under {DEFINITIONS_TITLE}."]
     missing: dict[str, list[str]] = {}
@@ -77,7 +83,7 @@ def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves
     lines += ["", "## The run", "", *_told_lines(run, RUN_WORDS)]
     lines += _effects_section(content["effects"])
     lines += ["", "## Data: findings and assumptions", "", *data_lines(content["data"])]
-    lines += ["", f"## {DEFINITIONS_TITLE}", "", *_bullets(content["definitions"])]
+    lines += ["", f"## {DEFINITIONS_TITLE}", "", *_definition_lines(content["definitions"])]
     lines += ["", "## Versions", "", *_bullets(content["versions"])]
     if entries := citations(run.get("method")):
         lines += ["", "## How to cite", "", *(f"- {entry}" for entry in entries)]
@@ -196,7 +202,7 @@ def _place(effect: Mapping[str, Any]) -> tuple[bool, bool]:
 
 def _effects_row(name: str, effect: Mapping[str, Any]) -> tuple[str, ...]:
     statistic, threshold, parameters, milliseconds = (
-        NONE if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else f"{effect[key]:.3g}"
+        NONE if effect[key] is None else f"{effect[key]:,}" if key == "parameters" else rounded(effect[key], 3)
         for key in ("statistic", "threshold", "parameters", "ms_per_step")
     )
     sure = "**yes**" if effect["on"] else "no"
@@ -206,14 +212,27 @@ def _effects_row(name: str, effect: Mapping[str, Any]) -> tuple[str, ...]:
     return _effect(name), on, statistic, threshold, *gains, effect["reason"], parameters, milliseconds
 
 
-def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str]]:
-    """Names and values of "test" or "cost" with their units, for a table; a dash for what could not be had."""
+def cells(content: Mapping[str, Any], section: str) -> list[tuple[str, str, str]]:
+    """Names of "test" or "cost", these in words, and values with their units, for a table; a dash for what could not be had."""
     cells = []
     for name, value in content[section].items():
         quantity = described(name)
-        unit = quantity.unit if quantity is not None else unit_of(content.get("definitions", {}).get(name))
-        cells.append((name, NONE if value is None else f"{_number(value)} {unit}".rstrip()))
+        told = unit_of(content.get("definitions", {}).get(name)) or words_and_unit(name)[1]
+        unit = quantity.unit if quantity is not None else told
+        words, unit = COST_WORDS.get(name, (_score(name), unit))
+        cells.append((name, words, NONE if value is None else f"{_number(value)} {unit}".rstrip()))
     return cells
+
+
+def _score(name: str) -> str:
+    """A score's title, or the words of its name where it is a callback's own."""
+    score = described(name)
+    return score.title if isinstance(score, Definition) else words_and_unit(name)[0]
+
+
+def _definition_lines(definitions: Mapping[str, Any]) -> list[str]:
+    """A list for Markdown of what metrics.json says of scores, each by its title and its name."""
+    return _told_lines(definitions, {name: (_score(name), words_and_unit(name)[1]) for name in definitions})
 
 
 def _number(value: float) -> str:
@@ -262,7 +281,8 @@ def _in_words(name: str, value: Any, known: Words) -> tuple[str, str]:
     if isinstance(value, Mapping):
         if name == "views":
             return words, ", ".join(f"{_words(count)} {PARTS.get(part, part)}" for part, count in value.items())
-        return words, ", ".join(" ".join(_in_words(*item, known)) for item in value.items()) or "on"
+        told = (item for item in value.items() if TWICE.get(item[0]) not in value and item[1] not in ("", []))
+        return words, ", ".join(" ".join(_in_words(*item, known)) for item in told) or "on"
     values = value if isinstance(value, list | tuple) else [value]
     numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
     if name in CLOCKS and numbers:

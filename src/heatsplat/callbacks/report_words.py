@@ -9,6 +9,19 @@ from collections.abc import Mapping
 
 Words = Mapping[str, tuple[str, str]]  # name -> (words, unit); "" for no unit, "%" for a share from 0 to 1
 
+COST_WORDS: Words = {
+    "choosing_seconds": ("choosing effects", "s"),
+    "train_seconds": ("training", "s"),
+    "cpu_seconds": ("processor time of it", "s"),
+    "steps_per_second": ("steps per second", ""),
+    "render_fps": ("frames per second", ""),
+    "peak_memory_mb": ("largest memory", "MB"),
+    "gaussians": ("Gaussians", ""),
+    "warmup_seconds": ("warm-up", "s"),
+    "evaluation_seconds": ("validation", "s"),
+    "wall_seconds": ("first to last step", "s"),
+}
+
 DATA_WORDS: Words = {
     "views": ("images", ""),
     "image_sizes": ("size of the images in training", "pixels"),
@@ -62,8 +75,8 @@ RUN_WORDS: Words = {
     # an early end
     "early_stop": ("stopped early", ""),
     "at_step": ("decided at step", ""),
-    "gained_percent": ("gain of the last tenth in %", ""),
-    "standard_error_percent": ("its standard error in %", ""),
+    "gained_percent": ("gain of the last tenth", "percent"),
+    "standard_error_percent": ("its standard error", "percent"),
     "residual": ("error that is left", ""),
     "camera_noise": ("of which noise of the camera", ""),
     "why": ("because", ""),
@@ -72,13 +85,13 @@ RUN_WORDS: Words = {
     "asked_s": ("asked for", "s"),
     "calibration_s": ("spent on measuring the machine", "s"),
     "train_s": ("spent on training", "s"),
-    "off_percent": ("missed by, in %", ""),
+    "off_percent": ("missed by", "percent"),
     "max_gaussians": ("most Gaussians", ""),
     "schedule_done": ("of the schedule done", "%"),
     "expected_psnr_on_demo_scenes": ("PSNR to expect on demo scenes", "dB"),
     "twice_gain_db": ("gain of twice the time", "dB"),
     "twice_steps": ("steps in twice the time", ""),
-    "twice": ("in twice the time", ""),
+    "twice": ("by the plan", ""),
 }
 
 # Physical effects, as headings.

@@ -7,7 +7,7 @@ from copy import deepcopy
 from dataclasses import asdict, replace
 from typing import Any
 
-from heatsplat.contracts import SceneData, SceneError, check_option
+from heatsplat.contracts import SceneData, SceneError, check_option, rounded
 from heatsplat.effects.base import CHOICES, SLOTS, Effect, Verdict
 from heatsplat.effects.catalogue import CATALOGUE
 
@@ -289,7 +289,7 @@ def verdict_table(verdicts: Mapping[str, Mapping[str, Any]]) -> list[str]:
     for name, verdict in verdicts.items():
         measured = verdict["statistic"] is not None
         sign = ">" if measured and verdict["statistic"] > verdict["threshold"] else "≤"
-        statistic = f"{verdict['statistic']:.3g} {sign} {verdict['threshold']:.3g}" if measured else "–"
+        statistic = f"{rounded(verdict['statistic'], 3)} {sign} {verdict['threshold']:.3g}" if measured else "–"
         priced = "ms_per_step" in verdict
         numbers = f"{verdict['per_gaussian']:+d} N {verdict['shared']:+d}" if priced else ""
         milliseconds = f"{verdict['ms_per_step']:+.2f}" if priced else ""

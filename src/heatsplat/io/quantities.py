@@ -37,12 +37,14 @@ SUFFIXES = {
     "_k": "K",
     "_c": "°C",
 }
+WRITTEN = {"u_value": "U-value"}  # names that are written otherwise than with spaces
 
 
 def words_and_unit(name: str) -> tuple[str, str]:
     """Such as ("time constant", "s") of "time_constant_s"; the unit is empty where the name has none."""
     suffix = next((suffix for suffix in SUFFIXES if name.endswith(suffix)), "")
-    return name.removesuffix(suffix).replace("_", " "), SUFFIXES.get(suffix, "")
+    bare = name.removesuffix(suffix)
+    return WRITTEN.get(bare, bare.replace("_", " ")), SUFFIXES.get(suffix, "")
 
 
 def impossible(name: str, values: np.ndarray, weights: np.ndarray | None = None) -> str:

@@ -65,8 +65,7 @@ def find_backbone(net: str, path: str | Path | None = None) -> Path:
     if not found.is_file():
         raise LpipsUnavailable(
             f"LPIPS({net}) needs the backbone's ImageNet weights, which are not at {found}. Download "
-            f"https://download.pytorch.org/models/{FILES[net]} to that place, or name the file in the metrics callback "
-            "(lpips_weights)."
+            f"https://download.pytorch.org/models/{FILES[net]} to that place, or give callbacks.metrics.lpips_weights=FILE."
         )
     if path is None:
         expected = found.stem.rsplit("-", 1)[1]

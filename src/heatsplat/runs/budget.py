@@ -187,7 +187,7 @@ class Plan:
         """What the log says."""
         cap = "no Gaussians are added" if self.cap is None else f"at most {self.cap:,} Gaussians"
         left = f"{self.asked_s:g} s less {self.calibration_s:.1f} s of calibration (a step takes {self.step_ms:.1f} ms at first)"
-        decay = "" if self.decay is None else f", {self.decay:.0%} of the decay of learning rates"
+        decay = "" if self.decay in (None, 1.0) else f", {self.decay:.0%} of the decay of learning rates"
         others = "".join(f", {text}" for text in self.settings)
         first = f"budget: {self.steps:,} steps, {cap}{decay}{others} for {left}"
         if self.expected_psnr is not None:

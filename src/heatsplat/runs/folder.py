@@ -8,7 +8,7 @@ from typing import Any
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.runs.checks import checked
 from heatsplat.runs.lock import OccupiedError
-from heatsplat.runs.resume import checkpoints_in, differences, new_in, stored_config
+from heatsplat.runs.resume import checkpoints_in, differences, new_in, shortened, stored_config
 
 
 def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
@@ -24,12 +24,12 @@ def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
     changed = differences(checked(config), stored) if stored else []
     if changed and len(new_in(config, stored, changed)) == len(changed):
         raise OccupiedError(
-            f"{folder} holds the results of an older heatsplat, which did not have {', '.join(changed)}: give another folder "
+            f"{folder} holds the results of an older heatsplat, which did not have {shortened(changed)}: give another folder "
             "with hydra.run.dir (of a sweep: hydra.sweep.dir), or delete that one, and it is trained anew"
         )
     if changed:
         raise OccupiedError(
-            f"{folder} holds the results of a run with other settings ({', '.join(changed)}): give another folder with "
+            f"{folder} holds the results of a run with other settings ({shortened(changed)}): give another folder with "
             "hydra.run.dir, or delete that one"
         )
     return RunResults.read(folder / METRICS_FILE)

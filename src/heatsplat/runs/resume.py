@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -139,19 +139,24 @@ def stored_config(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     return config if isinstance(config, dict) else {}
 
 
+def shortened(names: Sequence[str]) -> str:
+    """Names of settings for a message: the first, and how many more there are."""
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return f"{', '.join(names[:SHOWN])}{more}"
+
+
 def _check_own(config: dict[str, Any], output_dir: Path, path: Path, checkpoint: Mapping[str, Any]) -> None:
     """Raises OccupiedError where a checkpoint in a run's folder is of other settings."""
     if changed := differences(config, stored_config(checkpoint)):
-        more = f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else ""
         step = checkpoint.get("global_step")
         if len(new_in(config, stored_config(checkpoint), changed)) == len(changed):
             raise OccupiedError(
                 f"{output_dir} holds an unfinished run of an older heatsplat, which did not have "
-                f"{', '.join(changed[:SHOWN])}{more}: ckpt={path} hydra.run.dir={output_dir} goes on from step {step}, and they "
+                f"{shortened(changed)}: ckpt={path} hydra.run.dir={output_dir} goes on from step {step}, and they "
                 "count from there on; or delete that folder (of a sweep: that of the job), and the same command trains it anew"
             )
         raise OccupiedError(
-            f"{output_dir} holds an unfinished run with other settings ({', '.join(changed[:SHOWN])}{more}), of which "
+            f"{output_dir} holds an unfinished run with other settings ({shortened(changed)}), of which "
             f"{path.name} is of step {step}: give another folder with hydra.run.dir; or go on with that "
             f"run, with its settings and ckpt={path}; or delete that folder"
         )

@@ -9,7 +9,7 @@ from dataclasses import fields
 from typing import Any
 
 from heatsplat.composition import build
-from heatsplat.contracts import SceneData
+from heatsplat.contracts import SceneData, counted
 from heatsplat.effects import assembly
 from heatsplat.effects.base import Verdict
 from heatsplat.runs.device import device_of
@@ -35,7 +35,7 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
 
         on = [name for name, verdict in verdicts.items() if verdict.on]
         leaving = {name: maker(assembly.without(verdicts, name)) for name in on}
-        log.info("measuring what each of %d effects costs", len(on))
+        log.info("measuring the cost of %s", counted(len(on), "effect"))
         costs = prices(
             maker(verdicts),
             leaving,

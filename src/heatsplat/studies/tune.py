@@ -281,7 +281,9 @@ def _search(
             study.tell(asked, value)
         # What failed has left no cost; what was there already has one, though it took no time now.
         spent += time.perf_counter() - began if trial.results is None else trial.results.cost["wall_seconds"] or 0.0
-        log.info("%s, %s: %s %s", runs.method, " ".join(_words(trial.settings)), score, number(value, 3))
+        log.info(
+            "%s, %s: %s %s", runs.method, " ".join(_words(trial.settings)), DEFINITIONS[score].heading, number(value, 3)
+        )
         yield trial
 
 
@@ -343,7 +345,7 @@ def markdown(
     which = f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"
     lines = ["# Tuning", "", about, "", f"## The best settings of each search beside the default, {which}", ""]
     columns = [described(name).heading for name in COLUMNS]
-    head = ["method", "steps", "settings", "seeds", *columns, f"gain ({score})", "verdict"]
+    head = ["method", "steps", "settings", "seeds", *columns, f"gain in {DEFINITIONS[score].heading}", "verdict"]
     rows = []
     for check in checks:
         best = _best([trial for trial in tried if trial.method == check.method], score)

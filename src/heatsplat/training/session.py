@@ -28,16 +28,25 @@ class Unprofiled(PassThroughProfiler):
 
 
 class StopOnInterrupt(pl.Callback):
-    """Ends training after the current step when Ctrl-C was pressed; a second Ctrl-C aborts at once."""
+    """Ends training after the current step when Ctrl-C was pressed; a second Ctrl-C aborts at once.
+
+    SIGTERM stays with whoever listens outside (``runs.signals.stoppable``): Lightning, which takes it when training starts, would
+    end the run on its own after the step, without a checkpoint and with exit code 0.
+    """
 
     def __init__(self) -> None:
         self.interrupted = False
+        self._sigterm: Any = None
 
     def ask(self, *_: Any) -> None:
         if self.interrupted:
             raise KeyboardInterrupt
         self.interrupted = True
         log.warning("Interrupted: finishing this step and writing a checkpoint. Press Ctrl-C again to abort at once.")
+
+    def on_train_start(self, *_: Any) -> None:
+        if self._sigterm is not None:
+            signal.signal(signal.SIGTERM, self._sigterm)
 
     def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
         if self.interrupted:
@@ -51,6 +60,7 @@ class StopOnInterrupt(pl.Callback):
         except ValueError:
             yield
             return
+        self._sigterm = signal.getsignal(signal.SIGTERM)
         try:
             yield
         finally:

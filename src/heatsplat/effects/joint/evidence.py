@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+from heatsplat.contracts import rounded
 from heatsplat.effects.base import Evidence
 from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.certainty import Certainty
@@ -75,4 +76,4 @@ def outdone(inspected: Inspection, name: str, others: Collection[str]) -> bool:
 
 def beside(size: float) -> str:
     """The size of an effect in words."""
-    return f"{size:.2g} times the error expected of an observation"
+    return f"{rounded(size, 2)} times the error expected of an observation"

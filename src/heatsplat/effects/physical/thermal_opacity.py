@@ -41,7 +41,7 @@ def evidence(inspected: Inspection) -> Evidence:
     sure = (thermal != 0) & (visible != 0)
     n, apart = int(sure.sum()), int((thermal[sure] != visible[sure]).sum())
     if n < MIN_VOTES:
-        why = f"{n} points lie behind others so that both modalities could tell them apart"
+        why = f"of the points behind others, both modalities could tell {n} apart"
         told = (
             apart == 0
             or sum(math.comb(n, k) * PRESENT**k * (1 - PRESENT) ** (n - k) for k in range(apart + 1)) < UNLIKELY

@@ -119,7 +119,7 @@ class Map(Format):
                 file.set_band_description(number, name)
                 if name.startswith(DEVIATION):
                     file.update_tags(number, of=deviations_told(scene))
-                    log.info("%s: %s", name, deviations_told(scene))
+                    log.info("band %d, %s: %s", number, name, deviations_told(scene))
             file.update_tags(
                 layer=moment.layer.name,
                 lengths=place.unit,

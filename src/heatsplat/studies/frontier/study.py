@@ -75,7 +75,7 @@ def run(
     found = find_runs(folders)
     if found.empty:
         raise SceneError(
-            f"runs={', '.join(map(str, folders))}: there is no finished run (no {METRICS_FILE} that can be read with a "
+            f"study.runs={', '.join(map(str, folders))}: there is no finished run (no {METRICS_FILE} that can be read with a "
             f"{CURVE_FILE} beside). Give folders that src/train.py wrote, such as "
             "study.runs=[outputs/etgs_cooling,outputs/sweeps/...]; a run whose files are damaged must be trained again, in "
             "a new folder."

@@ -145,7 +145,7 @@ class Reproduction:
             try:
                 find_backbone(str(lpips_net), lpips_weights)
             except LpipsUnavailable as error:
-                lines.append(f"  LPIPS will be n/a; callbacks.metrics.lpips_weights=FILE names another file. {error}")
+                lines.append(f"  LPIPS will be n/a. {error}")
         if self.missing and self.source:
             lines += ["", self._how_to_get(self.source)]
         return "\n".join(lines)

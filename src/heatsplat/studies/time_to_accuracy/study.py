@@ -91,7 +91,7 @@ def run(
     panels = panels_of(find_runs(folders, clock), clock, reference, recipes, margins, common, (cases or {}).values())
     if not panels:
         raise SceneError(
-            f"runs={', '.join(map(str, folders))}: there is no finished run of the reference ({' '.join(reference)}) that "
+            f"study.runs={', '.join(map(str, folders))}: there is no finished run of the reference ({' '.join(reference)}) that "
             f"tells its {clock}, PSNR and Gaussians. Give folders that src/train.py wrote with these overrides, or "
             "study.cases, and they are trained."
         )
