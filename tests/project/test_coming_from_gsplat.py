@@ -59,4 +59,4 @@ def test_a_camera_is_led_back_to_its_image(tmp_path):
     heatsplat.train(compose(["method=etgs", *quick]), tmp_path)
     found = {"CHECKPOINT": tmp_path / "checkpoints" / "last.ckpt"}
     exec(EXAMPLES[1], found)
-    assert found["offset"].norm().item() < 0.02
+    assert found["offset"].norm().item() < 0.025
