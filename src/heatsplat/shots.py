@@ -294,9 +294,8 @@ def write_shot(
             stem, share = stems[frame.name], 1.0 if seen is None else seen.float().mean().item()
             beyond = scene.beyond_record(frame.time_s)
             rows.append((stem, frame.time_s, round(share, 4), round(beyond, 3)))
-            title = (
-                stem if frame.time_s is None else f"{moment(frame.time_s, clock)}   {stem}"
-            )  # what is narrow cuts the end
+            # The time first: a narrow picture cuts off the end of its title.
+            title = stem if frame.time_s is None else f"{moment(frame.time_s, clock)}   {stem}"
             limits = [f"prediction, {moment(beyond)} beyond the record"] if beyond else []
             limits += [f"{100 * share:.0f} % seen"] if share < 0.995 else []
             panels = []

@@ -55,8 +55,8 @@ def test_the_renderer_alone_learns_an_image():
 
 
 def test_a_camera_is_led_back_to_its_image(tmp_path):
-    quick = ["data.scene=cooling", *TINY, "max_steps=100", "test=false", "doctor=false"]
+    quick = ["data.scene=cooling", *TINY, "max_steps=150", "test=false", "doctor=false"]
     heatsplat.train(compose(["method=etgs", *quick]), tmp_path)
     found = {"CHECKPOINT": tmp_path / "checkpoints" / "last.ckpt"}
     exec(EXAMPLES[1], found)
-    assert found["offset"].norm().item() < 0.025
+    assert found["offset"].norm().item() < 0.02
