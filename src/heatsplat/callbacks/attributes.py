@@ -96,9 +96,8 @@ class LearnedValues(pl.Callback):
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         scene = module.scene
-        frame = replace(
-            scene.train.frames[0], frame_id=first_free_id(scene)
-        )  # what is known of that one image is not meant
+        # An id of its own: what is known of that one image is not meant.
+        frame = replace(scene.train.frames[0], frame_id=first_free_id(scene))
         if frame.time_s is not None:
             frame = at_time(scene, frame, scene.middle_s)
         told = module.attributes(frame)

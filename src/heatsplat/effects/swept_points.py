@@ -106,9 +106,8 @@ def _swept(
         torch.stack([(order % across)[:, None] + right.flatten(), (order // across)[:, None] + down.flatten()], 2) + 0.5
     )
     matrix, viewmat = camera.K.double(), camera.viewmat.double()
-    rays = torch.linalg.solve(matrix, torch.cat([_block(camera) * at, torch.ones_like(at[..., :1])], 2)[..., None])[
-        ..., 0
-    ]
+    pixels = torch.cat([_block(camera) * at, torch.ones_like(at[..., :1])], 2)
+    rays = torch.linalg.solve(matrix, pixels[..., None])[..., 0]
     away = float((middle - camera.center.double()).norm())
     depths = 1.0 / torch.linspace(1.0 / (FARTHEST * away), 1.0 / (NEAREST * away), DEPTHS, dtype=torch.float64)
     scores = torch.stack([_alike(own, rays, depths, viewmat, cameras[i], images[i]) for i in others])
