@@ -194,7 +194,7 @@ def test_the_configuration_holds_the_defaults(request):
 
 
 def test_the_recipe_is_the_released_one():
-    config = compose(["method=etgs_released"])
+    config = compose(["method=etgs_released", "recipe=published"])
     photometric = config["loss"]["terms"]["photometric"]
     assert (photometric["dssim_weight"], photometric["dssim_half"]) == (0.2, False)
     assert config["optim"]["opacity_logits"] == 0.025
