@@ -2,6 +2,7 @@
 
 import logging
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from running import TINY
 from heatsplat.composition import build, compose
 from heatsplat.contracts import SceneError
 from heatsplat.geometry.neighbours import neighbour_distances
+from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.io.ply import read_splats, write_splats
 from heatsplat.thermal.base import PerGaussian
@@ -31,6 +33,37 @@ def test_a_gaussian_is_as_large_as_the_distance_to_its_neighbours(parts):
     size = neighbour_distances(scene.points.float()).square().mean(1).sqrt()
     assert torch.allclose(splats.scales.detach(), 0.5 * size[:, None].expand(-1, 3), rtol=1e-5)
     assert torch.allclose(splats.opacities.detach(), torch.tensor(0.1))
+
+
+def test_a_gaussian_lies_in_the_plane_of_its_neighbours_and_is_as_thick_as_they_are(parts):
+    scene, thermal = parts
+    generator = torch.Generator().manual_seed(0)
+    wall, cloud = (torch.rand(2000, 3, generator=generator) for _ in range(2))
+    normal = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.8]), dim=0)
+    across = torch.nn.functional.normalize(torch.linalg.cross(normal, torch.tensor([0.0, 0.0, 1.0])), dim=0)
+    wall = wall[:, :1] * across + wall[:, 1:2] * torch.linalg.cross(normal, across) + 1e-4 * wall[:, 2:] * normal
+    balls, planes = (
+        Initialisation(thinnest=thinnest)(replace(scene, points=torch.cat([wall, cloud + 5.0])), thermal, seed=0)[0]
+        for thinnest in (1.0, 0.1)
+    )
+    assert torch.equal(planes.scales[:, :2], balls.scales[:, :2])  # as wide
+    shares = (planes.scales / balls.scales)[:, 2].detach()
+    assert torch.allclose(shares[:2000], torch.tensor(0.1)) and 0.5 < shares[2000:].median() < 0.8 and shares.max() <= 1.0
+    thin = quats_to_matrices(planes.quats)[:2000, :, 2].detach()
+    assert (thin @ normal).abs().min() > 0.99
+    assert torch.equal(balls.quats, torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4000, 4))
+
+
+def test_points_on_a_line_start_as_balls(parts):
+    scene, thermal = parts
+    line = torch.linspace(0, 1, 40)[:, None] * torch.tensor([1.0, 2.0, 3.0])
+    splats, _ = Initialisation(thinnest=0.1)(replace(scene, points=line), thermal, seed=0)
+    assert torch.equal(splats.scales, splats.scales[:, :1].expand(-1, 3)) and splats.quats.isfinite().all()
+
+
+@pytest.mark.parametrize(("recipe", "thinnest"), [([], 0.1), (["recipe=published"], 1.0), (["init=random"], 1.0)])
+def test_published_and_drawn_gaussians_start_as_balls(recipe, thinnest):
+    assert compose(["method=etgs", *recipe])["init"]["thinnest"] == thinnest
 
 
 @pytest.mark.parametrize(
@@ -76,7 +109,8 @@ def test_no_more_start_than_density_control_allows(parts, source, caplog):
 
 @pytest.mark.parametrize("source", ["sfm", "random"])
 @pytest.mark.parametrize(("options", "told"), [({"count": -5}, "got 1.0 and -5"), ({"count": 0}, "init.count at least 1"),
-                                               ({"scale": 0.0}, "init.scale must be above 0")])  # fmt: skip
+                                               ({"scale": 0.0}, "init.scale must be above 0"),
+                                               ({"thinnest": 0.0}, "init.thinnest must lie in .0, 1., got 0.0")])  # fmt: skip
 def test_no_gaussians_and_no_size_are_refused(source, options, told):
     with pytest.raises(ValueError, match=told):
         Initialisation(source, **options)

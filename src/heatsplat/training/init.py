@@ -12,6 +12,8 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, evenly_spread
 from heatsplat.geometry.neighbours import neighbour_distances
+from heatsplat.geometry.rotations import matrices_to_quats
+from heatsplat.geometry.surfaces import plane_thickness
 from heatsplat.geometry.voxels import cells, middles, spacing
 from heatsplat.io.ply import read_splats
 from heatsplat.physics.units import celsius
@@ -24,6 +26,7 @@ from heatsplat.training.trained_frames import camera_movement
 log = logging.getLogger(__name__)
 
 NEIGHBOURS = 3  # a new splat is as large as the distance to its nearest points (Kerbl et al. 2023)
+OF_A_PLANE = 10  # points, itself among them, that tell the plane in which it lies
 MIN_SQUARED_DISTANCE = 1e-7
 LONE_SIZE = 0.1  # semi-axis in extents of a Gaussian that is the only one and has no neighbours
 ABSENT = -30.0  # logit of an opacity of 1e-13: what no renderer shows and no gradient reaches
@@ -64,6 +67,8 @@ class Initialisation(Start):
             draw. None takes all points.
         opacity: initial opacity in (0, 1).
         scale: factor on the initial size, above 0.
+        thinnest: least semi-axis across the plane of the nearest points, as a share of those in it. A Gaussian is as thick as
+            these points are, and lies in their plane; at 1 it is a ball.
         separate: each modality starts with Gaussians of its own, which the others do not see and never will: their
             opacity there is ``ABSENT``. Needs a thermal model whose images have opacities of their own.
 
@@ -77,6 +82,7 @@ class Initialisation(Start):
         count: int | None = None,
         opacity: float = 0.1,
         scale: float = 1.0,
+        thinnest: float = 1.0,
         separate: bool = False,
     ) -> None:
         if source not in ("sfm", "random"):
@@ -85,8 +91,10 @@ class Initialisation(Start):
             raise ValueError(f"init.opacity must lie in (0, 1), got {opacity}")
         if scale <= 0 or (count is not None and count < 1):
             raise ValueError(f"init.scale must be above 0 and init.count at least 1, or null, got {scale} and {count}")
+        if not 0 < thinnest <= 1:
+            raise ValueError(f"init.thinnest must lie in (0, 1], got {thinnest}")
         self.source, self.count, self.opacity, self.scale = source, count, opacity, scale
-        self.separate = separate
+        self.thinnest, self.separate = thinnest, separate
 
     def __call__(
         self, scene: SceneData, thermal: ThermalModel, seed: int, cap_max: float | None = None
@@ -105,6 +113,10 @@ class Initialisation(Start):
             "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
             "opacity_logits": logit.repeat(count, len(thermal.opacity_channels)),
         }
+        if self.thinnest < 1:
+            axes, thickness = plane_thickness(scene.points, means, OF_A_PLANE)
+            geometry["quats"] = matrices_to_quats(axes).float()
+            geometry["log_scales"][:, 2] += thickness.clamp(self.thinnest, 1.0).log().float()
         if self.separate:
             geometry = _separate(geometry)
         return with_heat(geometry, scene, thermal, seed)
