@@ -20,7 +20,8 @@ PARTS = {"near": 8, "views": 0.12, "times": None, "weather": [[0.5, 1.0]]}
 def written(tmp_path_factory):
     root = tmp_path_factory.mktemp("protocol")
     scene = Synthetic(scene="outdoor", size="tiny", split="parts", parts=PARTS).scene
-    cover = torch.linspace(0.0, 0.7, len(scene.weather.times_s), dtype=torch.float64)  # share of light; another than light tells
+    # Share of light, which is another than light tells.
+    cover = torch.linspace(0.0, 0.7, len(scene.weather.times_s), dtype=torch.float64)
     weather = replace(scene.weather, clouds=cover, notes={**scene.weather.notes, "clouds": OF_COVER})
     scene = replace(scene, weather=weather, point_features=scene.points.float() ** 2)
     write_scene(scene, root / "scenes" / "yard", root / "truth" / "yard", {"protocol": 1, "size": "tiny"})
