@@ -33,8 +33,8 @@ log = logging.getLogger("heatsplat")
 
 UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 MIN_STEPS = 100  # below, the schedule loses its shape: growth, which comes every 50 steps or more, has no time
-CALIBRATION_SHARE = 0.05  # of the budget at most
 SPARE = 1.25  # times the least is what is advised: the next start measures anew, in a busier moment perhaps
+CALIBRATION_SHARE = 0.05  # of the budget at most
 CALIBRATION_SECONDS = 4.0  # and at most this long
 CALIBRATION_ROUNDS = (3, 200)  # fewest and most timed steps of each size; fewer than three have no middle
 CALIBRATION_VIEWS = 20  # that take turns in them
