@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from few_sorted import with_few_sorted
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, ViewSet
 from heatsplat.sensors.base import SensorChain
@@ -47,6 +48,16 @@ def test_no_strength_is_no_change_and_flat_images_stay_reversible():
     assert (shown.diff(dim=0) > 0).all()
     with pytest.raises(ValueError, match="strength"):
         HistogramAlignment(strength=2.0)
+
+
+def test_large_images_have_histograms(monkeypatch):
+    scene, images = drifted()
+    known = HistogramAlignment()
+    known.prepare(scene)
+    with_few_sorted(monkeypatch, 100)
+    part = HistogramAlignment()
+    part.prepare(scene)
+    assert torch.allclose(part.own, known.own) and torch.allclose(part.shared, known.shared)
 
 
 def test_an_image_that_its_mask_hides_has_the_histogram_of_all():

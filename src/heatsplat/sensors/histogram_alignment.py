@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Frame, SceneData, SceneError
+from heatsplat.contracts import Frame, SceneData, SceneError, quantile
 from heatsplat.sensors.per_frame import PerFrame
 
 LEAST_RISE = 1e-3  # between neighbouring quantiles, image units: maps stay reversible where an image is flat
@@ -48,7 +48,7 @@ class HistogramAlignment(PerFrame):
             values = view.image(modality)
             values = values if view.mask is None else values[view.mask]
             unknown = not values.numel()  # its mask leaves none: the shared histogram stands for its own
-            found[view.frame.frame_id] = shares * torch.nan if unknown else values.flatten().float().quantile(shares)
+            found[view.frame.frame_id] = shares * torch.nan if unknown else quantile(values.flatten().float(), shares)
         rows = torch.stack([found[int(frame_id)] for frame_id in self.frame_ids])
         if rows.isnan().all():
             raise SceneError(f"masks leave no pixel of the training images of scene '{scene.name}'")
