@@ -18,6 +18,7 @@ from heatsplat.contracts import SceneData, SceneError, View
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.formats.colmap import pinholes, write_model
 from heatsplat.datamodules.posed_frames import FILES
+from heatsplat.datamodules.surroundings import FEATURES_FILE, LABELS_FILE, WEATHER_FILE
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.weather_table import write_weather
 from heatsplat.geometry.transforms import camera_entry
@@ -128,7 +129,9 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
     poses = {name: camera.viewmat.numpy() for name, camera in cameras.items()}
     write_model(folder / "sparse" / "0", poses, kinds, points, colors, camera_of=camera_of)
     if scene.labels is not None:
-        np.save(folder / "labels.npy", scene.labels.numpy())
+        np.save(folder / LABELS_FILE, scene.labels.numpy())
+    if scene.point_features is not None:
+        np.save(folder / FEATURES_FILE, scene.point_features.numpy())
     meta = {
         **also,
         "scene": scene.name,
@@ -138,7 +141,7 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
         "metres_per_unit": scene.metres_per_unit,
     }
     if scene.weather is not None:
-        write_weather(folder / "weather.csv", scene.weather)
+        write_weather(folder / WEATHER_FILE, scene.weather)
         site = ("latitude", "longitude", "altitude_m", "up", "north")
         meta |= {key: scene.weather.notes[key] for key in site if key in scene.weather.notes} | {"utc_at_zero_s": clock}
     if scene.true_attributes is not None:

@@ -18,6 +18,7 @@ from heatsplat.datamodules.weather_table import (
     COVER,
     FALLEN,
     FIRST_EPOCH_S,
+    OF_COVER,
     PYRANOMETER_OFFSET,
     QUANTITIES,
     read_columns,
@@ -237,7 +238,7 @@ def _complete(times_s: np.ndarray, columns: dict[str, np.ndarray], source: str, 
             columns["irradiance_w_m2"] = columns["irradiance_w_m2"].clip(0.0)
     if COVER in columns:
         columns["clouds"] = light_taken(columns.pop(COVER))
-        notes["clouds"] = "of the cover in the record (Kasten and Czeplak)"
+        notes["clouds"] = OF_COVER
     if FALLEN in columns:
         if RAIN in columns:
             raise SceneError(f"{source} tells rain twice, as {RAIN} and as {FALLEN}; keep one")

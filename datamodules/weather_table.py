@@ -21,6 +21,7 @@ import numpy as np
 
 from heatsplat.contracts import RAIN, WEATHER_COLUMNS, SceneError, Weather
 from heatsplat.datamodules.side_files import read_table
+from heatsplat.datamodules.sun import cover_of
 from heatsplat.datamodules.timestamps import zone_of
 
 log = logging.getLogger(__name__)
@@ -45,6 +46,7 @@ class Quantity:
 FALLEN = "rain_mm"  # since the sample before, of which RAIN follows
 RAIN_NAMES = ("rain", "precipitation", "precip", "rainfall", "total_precipitation")
 COVER = "cloud_cover"  # share of the sky that clouds take, of which light that they take follows (Weather.clouds)
+OF_COVER = "of the cover in the record (Kasten and Czeplak)"  # what a record notes of such clouds
 QUANTITIES: dict[str, Quantity] = {
     "air_c": Quantity(
         ("air", "air_temperature", "temperature", "temp", "t_air", "t2m", "temperature_2m"),
@@ -191,16 +193,22 @@ def _columns_of(
     return wanted, unused
 
 
-def write_weather(path: Path, weather: Weather, names: Sequence[str] = (*WEATHER_COLUMNS, RAIN)) -> None:
-    """Writes a record as a table that ``read_weather`` reads: ISO times in UTC where it knows them, else seconds."""
+def write_weather(path: Path, weather: Weather) -> None:
+    """Writes a record as a table that ``read_weather`` reads: ISO times in UTC where it knows them, else seconds.
+
+    Clouds are written where they were recorded; those that light tells of are told again by the light in the table.
+    """
     zero = weather.notes.get("utc_at_zero_s")
-    there = [name for name in names if getattr(weather, name) is not None]
+    columns = {name: getattr(weather, name) for name in (*WEATHER_COLUMNS, RAIN)}
+    if weather.notes.get("clouds") == OF_COVER:
+        columns[f"{COVER}_percent"] = 100.0 * cover_of(weather.clouds.numpy())
+    columns = {name: series for name, series in columns.items() if series is not None}
     with path.open("w", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(["time_s" if zero is None else "utc", *there])
+        rows.writerow(["time_s" if zero is None else "utc", *columns])
         for i, time in enumerate(weather.times_s.tolist()):
             moment = repr(time) if zero is None else utc_text(zero + time)
-            rows.writerow([moment, *(f"{getattr(weather, name)[i].item():.10g}" for name in there)])
+            rows.writerow([moment, *(f"{series[i].item():.10g}" for series in columns.values())])
 
 
 def utc_text(seconds: float) -> str:

@@ -20,7 +20,7 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
-from heatsplat.contracts import Camera, SceneData, SceneError, View, ViewSet, check_numbers
+from heatsplat.contracts import Camera, SceneData, SceneError, View, ViewSet, check_numbers, quantile
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import pinholes, write_model
@@ -376,7 +376,7 @@ def _beyond(few: Sequence[tuple[Camera, Tensor]], points: Tensor) -> str:
     for camera, depth in few:
         _, within = _pixels(camera, points)
         if within.any():
-            farthest = camera.project(points[within])[1].double().quantile(NEARLY_ALL)
+            farthest = quantile(camera.project(points[within])[1].double(), NEARLY_ALL)
             known = depth[depth.isfinite()]
             beyond.append((known > (1.0 + APART) * farthest).double())
     share = float(torch.cat(beyond).mean()) if beyond else 0.0
@@ -484,7 +484,7 @@ def _picture(found: Corrected) -> np.ndarray:
         (change, "change against one distance", "°C", (-most, most)),
     ):
         known = values[values.isfinite()]
-        low, high = ends or (float(known.quantile(0.01)), float(known.quantile(0.99))) if len(known) else (0.0, 1.0)
+        low, high = ends or (float(quantile(known, 0.01)), float(quantile(known, 0.99))) if len(known) else (0.0, 1.0)
         colours = "RdBu_r" if title.startswith("change") else "inferno"
         panels.append(Panel(colorize(values, low, high, colours), title, Bar(low, high, unit, colours)))
     return side_by_side(panels)

@@ -11,12 +11,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2  # before pycolmap: formats/colmap.py says why
+import cv2
 import numpy as np
-import pycolmap
 import torch
 
 from heatsplat.contracts import SceneError, check_numbers
+from heatsplat.datamodules.formats.colmap_library import pycolmap
 
 WEIGHTS = ("aliked-n16.pth", "aliked_lightglue.pth")
 DESCRIPTOR = 128  # numbers of a descriptor of ALIKED

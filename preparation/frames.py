@@ -104,10 +104,14 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     kinds: dict[str, list[Path]] = {}
     greys_known = reading.meaning.of_greys(folder)[0] is not None
     found = [path for path in shown_files(folder, (*SUFFIXES, *RECORDS, TABLE)) if path.is_file()]
+    tables: dict[Path, tuple[int, int]] = {}  # width and height: text is slow to read, and is read here anyway
     for path in sorted(found, key=lambda p: by_numbers(p.relative_to(folder).as_posix())):
-        kind = _kind(path)
-        if kind is None:
-            continue
+        if path.suffix.lower() == TABLE:
+            if (pixels := read_temperature_table(path)) is None:
+                continue
+            kind, tables[path] = "float", (pixels.shape[1], pixels.shape[0])
+        else:
+            kind = _kind(path)
         if kind == "sealed" and not greys_known:
             raise SceneError(
                 f"{path} is a thermal picture of DJI whose temperatures cannot be read: its sensor values are counts, or not "
@@ -132,7 +136,7 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     kind, thermal = there[0], kinds[there[0]]
     reading.meaning.check_use(kind, KINDS[kind])
     notes: list[str] = []
-    frames = list(_frames_of(kind, thermal, folder, reading, notes))
+    frames = list(_frames_of(kind, thermal, folder, reading, notes, tables))
     photos = [*kinds.get("colour", []), *(kinds["grey"] if kind != "grey" and "grey" in kinds else [])]
     frames = _paired(frames, _without_previews(frames, photos, notes))
     if reading.table is not None:
@@ -158,11 +162,9 @@ def _no_tables(found: Iterable[Path]) -> str:
     return f". None of its .csv has {MIN_SIDE} rows of {MIN_SIDE} numbers or more: {tables[0].name} {what}"
 
 
-def _kind(path: Path) -> str | None:
+def _kind(path: Path) -> str:
     """ "radiometric", "float", "counts", "grey", "colour", or "sealed": a thermal picture whose numbers only its maker's
-    software converts; None for a table of something else. Raises SceneError for what is no image."""
-    if path.suffix.lower() == TABLE:
-        return None if read_temperature_table(path) is None else "float"
+    software converts. Raises SceneError for what is no image."""
     if path.suffix.lower() in RECORDS:
         return "radiometric"
     if path.suffix.lower() in (".jpg", ".jpeg"):
@@ -207,7 +209,12 @@ def _greys_in_colour(kinds: dict[str, list[Path]], folder: Path) -> dict[str, li
 
 
 def _frames_of(
-    kind: str, paths: list[Path], folder: Path, reading: Reading, notes: list[str]
+    kind: str,
+    paths: list[Path],
+    folder: Path,
+    reading: Reading,
+    notes: list[str],
+    tables: Mapping[Path, tuple[int, int]],
 ) -> Iterator[ThermalFrame]:
     if kind == "radiometric":
         for path in paths:
@@ -216,9 +223,8 @@ def _frames_of(
     found = []
     for path in paths:
         if path.suffix.lower() == TABLE:
-            height, width = read_temperature_table(path).shape
             load = partial(read_temperature_table, path)
-            found.append(ThermalFrame(frame_name(path, folder), path, 0, load, size=(width, height)))
+            found.append(ThermalFrame(frame_name(path, folder), path, 0, load, size=tables[path]))
             continue
         details, camera = exif_details(read_bytes(path))
         _, size = _mode_and_size(path)

@@ -12,15 +12,15 @@ from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2  # before pycolmap: formats/colmap.py says why
+import cv2
 import numpy as np
-import pycolmap
 from rich import get_console
 from rich.progress import Progress, track
 from scipy.spatial import cKDTree
 
 from heatsplat.contracts import SceneError, check_numbers, check_option, counted, evenly_spread
 from heatsplat.datamodules.formats.colmap import pose_matrix
+from heatsplat.datamodules.formats.colmap_library import pycolmap
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
 from heatsplat.datamodules.formats.lens import MODELS

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import cv2  # noqa: F401  before pycolmap: formats/colmap.py says why
 import numpy as np
-import pycolmap
 import torch
 
 from heatsplat.datamodules.formats.colmap import pose_matrix
+from heatsplat.datamodules.formats.colmap_library import pycolmap
 from heatsplat.geometry.alignment import Similarity, pose_errors
 
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from few_sorted import with_few_sorted
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet, evenly_spread
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet, evenly_spread, quantile
 
 
 @pytest.mark.parametrize(
@@ -89,3 +90,29 @@ def test_thermal_images_alone_have_a_range():
     known = scene([0.0])
     assert known.range_of("thermal") is known.range_of("clean") is known.thermal_range
     assert known.range_of("rgb") is None
+
+
+SHARES = (0.3, 0.0, 1.0, torch.tensor([0.01, 0.5, 0.99]))
+
+
+@pytest.mark.parametrize("shares", SHARES, ids=str)
+@pytest.mark.parametrize("shape", [(17,), (400,), (401, 3)])
+def test_quantiles_of_many_values_are_those_that_torch_would_find(monkeypatch, shares, shape):
+    values = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    known, unknown = torch.quantile(values, shares, dim=0), values.clone()
+    unknown[3] = torch.nan
+    assert torch.equal(quantile(values, shares), known)
+    with_few_sorted(monkeypatch, 16)
+    assert torch.allclose(quantile(values, shares), known, rtol=1e-6, atol=0)
+    assert quantile(values, shares).dtype == values.dtype and quantile(unknown, shares).isnan().all()
+    if not isinstance(shares, float):
+        shares = shares.double()
+    assert torch.allclose(quantile(values.double(), shares).float(), known, rtol=1e-5)
+
+
+def test_a_scene_of_very_many_points_has_a_box(monkeypatch):
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0))
+    many = SceneData("scan", *[ViewSet([], list)] * 3, points)
+    known = many.box
+    with_few_sorted(monkeypatch, 100)
+    assert all(torch.allclose(one, other) for one, other in zip(many.box, known, strict=True))

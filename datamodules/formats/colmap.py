@@ -6,12 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-# cv2 first: pycolmap brings its own libpng symbols, and cv2 aborts on its first PNG if it is loaded after them.
-import cv2  # noqa: F401, I001
 import numpy as np
-import pycolmap
 
 from heatsplat.contracts import Camera, SceneError
+from heatsplat.datamodules.formats.colmap_library import pycolmap
 from heatsplat.datamodules.formats.colmap_records import check_records
 from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 

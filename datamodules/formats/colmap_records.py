@@ -10,9 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from struct import Struct, error
 
-import pycolmap
-
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.formats.colmap_library import pycolmap
 
 REMEDY = "copy the model or export it from COLMAP again"
 _NUMBER, _COUNT, _POSE = Struct("<I"), Struct("<Q"), 7 * 8  # a pose is a quaternion and a translation

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import cv2  # noqa: F401, I001  (before pycolmap: formats/colmap.py says why)
 import numpy as np
-import pycolmap
+
+from heatsplat.datamodules.formats.colmap_library import pycolmap
 
 _EARTH = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
 

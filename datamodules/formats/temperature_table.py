@@ -82,13 +82,20 @@ def _numbers(line: str, separator: str) -> list[float | None]:
     """The numbers of a line, NaN for an empty cell and None for one with words; none where it has fewer than ``MIN_SIDE`` cells,
     or half are words."""
     if '"' not in line:
-        cells = line.split(separator)
+        cells = (line if separator == "," else line.replace(",", ".")).split(separator)
+        if len(cells) < MIN_SIDE:
+            return []
+        try:
+            return [*map(float, cells)]  # as most rows are: quicker than cell by cell
+        except ValueError:
+            if 2 * sum(";" in cell for cell in cells) >= len(cells):  # these commas are decimal ones
+                return []
     else:  # around cells with a decimal comma, where commas separate these
         try:
             cells = next(csv.reader([line], delimiter=separator))
         except csv.Error:
             return []
-    cells = [cell.replace(",", ".").replace('"', "") for cell in cells]
+        cells = [cell.replace(",", ".").replace('"', "") for cell in cells]
     if len(cells) > MIN_SIDE and not cells[-1].strip():  # rows may end, and begin, with a separator
         cells.pop()
     if len(cells) > MIN_SIDE and not cells[0].strip():

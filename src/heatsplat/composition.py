@@ -49,12 +49,30 @@ def compose(overrides: Sequence[str] = (), name: str = "train") -> dict[str, Any
         raise TypeError(
             f"compose takes a list of overrides, such as ['method=etgs', 'max_steps=2000'], got {overrides!r}"
         )
+    with _users_kept():
+        return plain(compose_unresolved(overrides, name), overrides)
+
+
+@contextlib.contextmanager
+def _users_kept() -> Iterator[None]:
+    """The program around has its own configuration of Hydra again after it."""
     users = HydraConfig.instance().cfg if GlobalHydra.instance().is_initialized() and not _is_open() else None
     try:
-        return plain(compose_unresolved(overrides, name), overrides)
+        yield
     finally:
         if users is not None:
             HydraConfig.instance().cfg = users
+
+
+def copied_settings(overrides: Sequence[str]) -> dict[str, Any]:
+    """Settings of a run with these overrides of which composition made others, such as "cap_max", which density control has as
+    its own: dotted keys with their values. What changes them in the composed configuration does not reach those others."""
+    with _users_kept():
+        config = compose_unresolved(overrides)
+        values = plain(config, overrides)
+    told = (value for _, value in walk(OmegaConf.to_container(config, resolve=False)) if not isinstance(value, Mapping))
+    keys = {key for value in told for key in re.findall(r"\$\{([\w.]+)\}", str(value))}
+    return {key: at(values, key) for key in sorted(keys)}
 
 
 def _is_open() -> bool:

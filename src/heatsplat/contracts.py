@@ -26,6 +26,7 @@ from torch import Tensor
 from heatsplat.errors import SceneError, check_count, check_numbers, check_option, counted, is_number, rounded  # noqa: F401
 
 SHARE_OF_RANGE = "share of the image's range"  # unit of a course in image units
+SORTED = 1 << 24  # values of which torch.quantile finds quantiles; it refuses more
 
 
 @dataclass(frozen=True)
@@ -395,7 +396,7 @@ class SceneData:
     @property
     def box(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest corner [3] of the box that holds the points but for a hundredth at each end of every axis."""
-        low, high = torch.quantile(self.points.float(), torch.tensor([0.01, 0.99]), dim=0)
+        low, high = quantile(self.points.float(), torch.tensor([0.01, 0.99]))
         return low, high
 
     @property
@@ -528,6 +529,23 @@ class RenderOutput:
             return None
         alpha = self.alpha[0].detach()
         return torch.where(alpha > 1e-3, self.depth.detach() / alpha, torch.inf)
+
+
+def quantile(values: Tensor, shares: float | Tensor) -> Tensor:
+    """Quantiles [..., *] of values [n, *] along their first axis, as of ``torch.quantile``, which takes no more than ``SORTED``.
+
+    Args:
+        values: floating point, at least one; pixels and points may be many more.
+        shares: one, or [...] of the type of the values, from 0 to 1.
+    """
+    if len(values) <= SORTED:
+        return torch.quantile(values, shares, dim=0)
+    places = torch.as_tensor(shares, dtype=torch.float64, device=values.device) * (len(values) - 1)
+    ordered = values.sort(dim=0).values
+    below = places.long()
+    between = (places - below).to(values).reshape((*places.shape, *[1] * (values.ndim - 1)))
+    found = torch.lerp(ordered[below], ordered[(below + 1).clamp(max=len(values) - 1)], between)
+    return torch.where(ordered[-1].isnan(), torch.nan, found)  # where NaN comes to lie
 
 
 def evenly_spread(count: int, limit: int) -> list[int]:

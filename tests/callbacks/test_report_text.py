@@ -171,6 +171,12 @@ def test_the_run_is_told_in_words_beside_its_names(tmp_path):
     ]  # fmt: skip
 
 
+def test_errors_that_would_rise_are_told_so(tmp_path):
+    run = {"method": "auto", "scene": "hall", "camera_check": {"moved_px": 0.25, "error_falls": -0.105}}
+    told = markdown(RunResults(run=run), tmp_path, [], None)
+    assert "(`camera_check`): moved by 0.25 pixels, squared errors would rise by 10.5 %\n" in told
+
+
 def test_simulated_effects_and_their_settings_are_told_in_words(tmp_path):
     effects = {
         "harmonic_source": {"on": True, "frequencies": 24}, "convection": {"on": True, "body": "surface", "depth_m": 0.1},

@@ -3,7 +3,7 @@
 import pytest
 from helpers import ROOT
 
-from heatsplat.callbacks.report_words import COST_WORDS, EFFECT_WORDS, RUN_WORDS, SETTING_WORDS
+from heatsplat.callbacks.report_words import COST_WORDS, EFFECT_WORDS, RISE_WORDS, RUN_WORDS, SETTING_WORDS
 from heatsplat.effects.catalogue import CATALOGUE
 from heatsplat.metrics.definitions import COSTS
 
@@ -18,6 +18,11 @@ SOURCES = {
 def test_every_effect_of_the_catalogue_has_words_of_its_own():
     assert set(EFFECT_WORDS) == {effect.name for effect in CATALOGUE}
     assert len(set(EFFECT_WORDS.values())) == len(EFFECT_WORDS)
+
+
+def test_what_may_rise_has_words_for_its_fall():
+    assert RISE_WORDS.keys() <= RUN_WORDS.keys()
+    assert all(RUN_WORDS[name][0].replace("fall", "rise") == words for name, words in RISE_WORDS.items())
 
 
 def test_every_cost_has_words_of_its_own():

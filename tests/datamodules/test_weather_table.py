@@ -92,6 +92,24 @@ def test_time_zones(text, zone, hour):
     assert utc_seconds(text, zone, "here") == MIDNIGHT_S + 3600 * hour
 
 
+@pytest.mark.parametrize("lit", [True, False])
+def test_recorded_clouds_are_written_and_read_back(tmp_path, lit):
+    """By night, too, and where no light tells of them; those that light tells of are no column."""
+    times = MIDNIGHT_S + 3600.0 * np.arange(25)
+    light = {"irradiance_w_m2": 0.8 * clear_sky(SITE, times)} if lit else {}
+    columns = {"air_c": np.full(25, 15.0), "cloud_cover": np.linspace(0.0, 1.0, 25), **light}
+    for site in (SITE, None):
+        weather = make_weather(times, columns, site=site)
+        write_weather(tmp_path / "weather.csv", weather)
+        again = read_weather(tmp_path / "weather.csv", site=site)
+        assert (
+            torch.allclose(again.clouds, weather.clouds, atol=1e-9) and again.notes["clouds"] == weather.notes["clouds"]
+        )
+    if lit:
+        write_weather(tmp_path / "weather.csv", make_weather(times, {"air_c": columns["air_c"], **light}, site=SITE))
+        assert "cloud" not in (tmp_path / "weather.csv").read_text()
+
+
 def test_a_change_to_winter_time_does_not_move_the_record():
     """An hour apart by the clock of Zurich, two hours apart on the sun's."""
     first, last = (utc_seconds(f"2024-10-27T0{h}:30", "Europe/Zurich", "here") for h in (1, 3))

@@ -66,6 +66,21 @@ def lost_c(module, splats):
     return [module.scene.thermal_range.span_k * lost.item() for lost in (off.square().mean().sqrt(), strict)]
 
 
+def test_a_long_search_says_how_far_it_is(module, monkeypatch, caplog):
+    caplog.set_level("INFO", merging.__name__)
+    next(FlatMerging(views=2).levels(module, [0.05]))
+    assert [line.split(":")[0] for line in caplog.messages] == ["merged"]
+    monkeypatch.setattr(merging, "TOLD_SECONDS", 0.0)
+    told = []
+    for level in FlatMerging(views=2).levels(module, [0.02, 0.05]):
+        told.append([line for line in caplog.messages if line.startswith("merging, round ")])
+        rounds = {int(line.split()[2].strip(",")) for line in told[-1]}
+        assert rounds == set(range(level.found["rounds"] + 1))
+    for doing in ("weighing the Gaussians", "dealing out what changed", "comparing the images"):
+        assert any(f"{doing} (view 2 of 2): {len(module.splats)} Gaussians are left" in line for line in told[0])
+    assert len(told[1]) > len(told[0])
+
+
 def test_what_is_lost_is_measured_and_kept(module):
     before = len(module.splats)
     first, second = FlatMerging().levels(module, [0.02, 0.2])

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from few_sorted import with_few_sorted
 
 from heatsplat.contracts import Camera, SceneError
 from heatsplat.density.multiview_gate import MultiviewGate
@@ -93,6 +94,16 @@ def test_pixels_that_do_not_count_neither_are_the_largest_errors_nor_hide_them()
     assert policy.pixel_maps(error, target, step)[..., 0].nonzero().tolist() == [[0, 0], [0, 1], [0, 2], [0, 3]]
     assert policy._mean_error == pytest.approx((4 * 1.0 + 60 * 0.05) / 64)
     assert not policy.pixel_maps(torch.zeros(SIDE, SIDE), torch.full((SIDE, SIDE, 1), torch.nan), step).any()
+
+
+def test_of_a_large_image_the_largest_errors_are_found(monkeypatch):
+    error = torch.rand(SIDE, SIDE, generator=torch.Generator().manual_seed(0))
+    target = torch.full((SIDE, SIDE, 1), 0.5)
+    policy = control()
+    policy.noise = 0.0
+    known = policy.pixel_maps(error, target, 0)
+    with_few_sorted(monkeypatch, 100)
+    assert torch.equal(policy.pixel_maps(error, target, 0), known) and 0 < known.sum() < known.numel()
 
 
 @pytest.mark.parametrize("floor, least, most", [(True, 0.0, 0.01), (False, 0.9, 1.0)])

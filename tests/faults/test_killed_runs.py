@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 
 import pytest
 import pytorch_lightning as pl
@@ -12,6 +13,7 @@ from test_checkpoint_files import disk_of
 from heatsplat import composition
 from heatsplat.contracts import SceneError
 from heatsplat.runs import lock, run
+from heatsplat.runs.signals import stoppable
 from heatsplat.training.checkpoints import load_checkpoint
 
 SHORT = (
@@ -67,6 +69,21 @@ def test_killed_while_it_trains(config, whole, tmp_path, monkeypatch, step):
         with pytest.raises(Killed):
             run.train(config, tmp_path)
     assert not (tmp_path / "metrics.json").exists()
+    check_goes_on(config, tmp_path, whole)
+
+
+def test_stopped_by_sigterm_while_it_trains(config, whole, tmp_path, monkeypatch):
+    class Terminate(pl.Callback):
+        def on_train_batch_end(self, trainer, *_):
+            if trainer.global_step == 5:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "build_callbacks", with_more(run.build_callbacks, Terminate()))
+        with pytest.raises(SystemExit) as stopped, stoppable():
+            run.train(config, tmp_path)
+    assert stopped.value.code == 130 and not (tmp_path / "metrics.json").exists()
+    assert load_checkpoint(tmp_path / "checkpoints" / "last.ckpt")["global_step"] >= 5
     check_goes_on(config, tmp_path, whole)
 
 

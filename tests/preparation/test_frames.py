@@ -10,6 +10,7 @@ from camera_files import dji_jpeg, raw_for, temperatures, with_segment
 from recordings import START, STATED, read_frames, write_flir, write_images, write_sequence
 
 from heatsplat.contracts import SceneError
+from heatsplat.preparation import frames
 from heatsplat.preparation.frames import Reading, read_recording
 from heatsplat.preparation.meaning import Meaning
 
@@ -257,13 +258,16 @@ def test_every_image_of_a_tiff_is_a_frame(tmp_path, kind):
         read_frames(tmp_path, timed)
 
 
-def test_exported_tables_are_frames_and_other_tables_are_none(tmp_path):
+def test_exported_tables_are_frames_and_other_tables_are_none(tmp_path, monkeypatch):
     rows = np.round(np.linspace(15, 40, 18 * 20), 2).reshape(18, 20)
     for name, shift in (("IR_0001", 0), ("IR_0002", 1)):
         text = "\n".join(";".join(f"{value + shift:.2f}".replace(".", ",") for value in row) for row in rows)
         (tmp_path / f"{name}.csv").write_text("Emissivity;0,95\n" + text)
     (tmp_path / "weather.csv").write_text("time,air_c\n0,12\n")
+    read, reader = [], frames.read_temperature_table
+    monkeypatch.setattr(frames, "read_temperature_table", lambda path: read.append(path.stem) or reader(path))
     first, second = read_frames(tmp_path)
+    assert sorted(read) == ["IR_0001", "IR_0001", "IR_0002", "weather"], "once each, and the first for its meaning"
     assert (first.name, first.size, first.time) == ("IR_0001", (20, 18), None)
     np.testing.assert_allclose(first.temperature(), rows, atol=1e-5)
     np.testing.assert_allclose(second.temperature(), rows + 1, atol=1e-5)

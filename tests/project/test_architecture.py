@@ -100,7 +100,7 @@ DOORS = {
     "hydra": {"cli", "composition", "explanations"},
     "omegaconf": {"cli", "composition", "explanations"},
     "pytorch_lightning": {"training", "callbacks", "datamodules"},
-    "pycolmap": {"datamodules/formats", "preparation"},
+    "pycolmap": {"datamodules/formats"},
     "pvlib": {"datamodules"},
     "cv2": {"datamodules/formats", "datamodules/synthetic_scene", "io", "metrics", "preparation"},
     "numba": {"kernels"},

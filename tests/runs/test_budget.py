@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -274,12 +275,18 @@ def test_twice_the_time_is_what_a_plan_for_it_would_choose():
     assert f"{found.twice_gain_db:+.2f} dB" in found.twice() and "40 s" in found.twice()
 
 
-def test_too_little_time_is_refused_with_the_least():
-    with pytest.raises(SceneError, match=r"budget=1.5s is too short here: 100 steps .* take (\S+) s") as caught:
-        plan(POINTS, "etgs", PACE, 1.5, cap_max=100_000)
-    least = float(str(caught.value).split("take ")[1].split(" s")[0])
-    enough = replace(PACE, spent_s=CALIBRATION_SHARE * least)
-    assert plan(POINTS, "etgs", enough, least, cap_max=100_000).steps >= 100
+@pytest.mark.parametrize("spent_s", [0.05, 0.6])
+@pytest.mark.parametrize("slower", [1.0, 1.2])
+def test_too_little_time_is_refused_with_what_is_accepted(spent_s, slower):
+    """The next start measures anew: its calibration takes its share or its fewest steps, and all may be slower then."""
+    told = r"budget=0.5s is too short here: 100 steps .* take (\S+) s .* Give budget=(\S+)s, which"
+    with pytest.raises(SceneError, match=told) as caught:
+        plan(POINTS, "etgs", replace(PACE, spent_s=spent_s), 0.5, cap_max=100_000)
+    least, enough = map(float, re.search(told, str(caught.value)).groups())
+    again = Pace(slower * PACE.base_s, slower * PACE.per_gaussian_s, PACE.points)
+    again = replace(again, spent_s=max(CALIBRATION_SHARE * enough, slower * spent_s))
+    assert plan(POINTS, "etgs", again, enough, cap_max=100_000).steps >= 100
+    assert least < enough < 1.3 * least + 0.1
 
 
 def test_the_least_time_is_not_planned_for_what_takes_more():

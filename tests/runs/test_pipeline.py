@@ -14,7 +14,7 @@ import heatsplat
 from heatsplat.composition import build, run_of
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE
-from heatsplat.runs.checks import checked
+from heatsplat.runs.checks import check_copied, checked
 from heatsplat.runs.folder import results_in
 from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import differences, on_scene, resumed
@@ -143,6 +143,18 @@ def test_a_setting_that_is_changed_where_nothing_reads_it_is_refused(change, tol
     change(config)
     with pytest.raises(SceneError, match=told):
         checked(config)
+
+
+@pytest.mark.parametrize(("method", "key", "value"), [("etgs", "cap_max", 9), ("thermogs", "first_steps", 7)])
+def test_a_setting_that_others_were_made_of_is_refused_once_it_is_changed(tmp_path, method, key, value):
+    config = heatsplat.compose([*TINY, "max_steps=20", f"method={method}"])
+    told = rf"{key} was changed after compose, from \d+ to {value}, and would not take effect: .*'{key}={value}'\]\)"
+    with pytest.raises(SceneError, match=told):
+        heatsplat.train(config | {key: value}, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    read_where_they_are = {"test": False, "name": "mine", "data": config["data"] | {"seed": 3}}
+    check_copied(config | read_where_they_are)
+    check_copied(heatsplat.compose([f"method={method}", f"{key}={value}"]))
 
 
 def test_another_program_that_uses_hydra_composes_ours_and_goes_on_with_its_own(tmp_path):

@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from few_sorted import with_few_sorted
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, ViewSet
+from heatsplat.sensors.base import SensorChain
 from heatsplat.sensors.histogram_alignment import HistogramAlignment
 
 CAMERA = Camera(torch.eye(4), torch.eye(3), 24, 16)
@@ -48,6 +50,16 @@ def test_no_strength_is_no_change_and_flat_images_stay_reversible():
         HistogramAlignment(strength=2.0)
 
 
+def test_large_images_have_histograms(monkeypatch):
+    scene, images = drifted()
+    known = HistogramAlignment()
+    known.prepare(scene)
+    with_few_sorted(monkeypatch, 100)
+    part = HistogramAlignment()
+    part.prepare(scene)
+    assert torch.allclose(part.own, known.own) and torch.allclose(part.shared, known.shared)
+
+
 def test_an_image_that_its_mask_hides_has_the_histogram_of_all():
     scene, images = drifted()
     hidden = torch.zeros(16, 24, dtype=torch.bool)
@@ -63,8 +75,19 @@ def test_an_image_that_its_mask_hides_has_the_histogram_of_all():
         HistogramAlignment().prepare(replace(scene, train=views))
 
 
-def test_photos_have_no_such_histogram():
-    scene, _ = drifted()
-    photos = ViewSet(scene.train.frames, lambda i: View(scene.train.frames[i], None, rgb=torch.rand(16, 24, 3)))
+def test_of_two_kinds_of_images_those_are_aligned_that_it_makes():
+    scene, images = drifted()
+    photos = [torch.rand(16, 24, 3, generator=torch.Generator().manual_seed(1)) * (1 - 0.1 * i) for i in range(5)]
+    frames = scene.train.frames
+    part = HistogramAlignment(quantiles=17)
+    SensorChain({"alignment": part}).prepare(
+        replace(scene, train=ViewSet(frames, lambda i: View(frames[i], images[i], rgb=photos[i]))), "rgb"
+    )
+    own, alone = part.own.clone(), HistogramAlignment(quantiles=17)
+    views = ViewSet(frames, lambda i: View(frames[i], None, rgb=photos[i]))
+    alone.prepare(replace(scene, train=views), "rgb")
+    assert torch.equal(own, alone.own)
+    mean = torch.stack([photo.flatten().quantile(torch.linspace(0, 1, 17)) for photo in photos]).mean(0)
+    assert torch.allclose(part.shared, mean, atol=1e-6)
     with pytest.raises(SceneError, match="view 0.png has no thermal image; choose a method or data set that fits"):
-        HistogramAlignment().prepare(replace(scene, train=photos))
+        HistogramAlignment().prepare(replace(scene, train=views))

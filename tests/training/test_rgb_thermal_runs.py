@@ -69,6 +69,14 @@ def test_losses_are_those_of_a_model_for_each_image(scene, tmp_path):
     assert halves["smoothness"] == pytest.approx(0.3 * 2 * differences / still.numel(), rel=1e-3)
 
 
+def test_a_camera_s_part_of_a_run_on_visible_images_is_prepared_with_those(scene, tmp_path):
+    colour = ("method=3dgs", "thermal.modality=rgb", "thermal.channels=3", "sensor=histogram_alignment")
+    (part,) = stepper(scene, tmp_path, *colour).module.sensor.parts.values()
+    shares = torch.linspace(0.0, 1.0, part.count)
+    known = torch.stack([view.rgb.flatten().quantile(shares) for view in scene.train])
+    assert torch.allclose(part.shared, known.mean(0), atol=1e-3)
+
+
 def test_images_that_no_term_compares_are_warned_of(tmp_path, caplog):
     given = (*SHORT, "max_steps=1", "test=false", "trainer.limit_val_batches=0", "loss=photometric")
     run(tmp_path, *given, "method=3dgs_ir")

@@ -12,7 +12,15 @@ from heatsplat.callbacks.attributes import LEARNED_FILE
 from heatsplat.callbacks.courses import COURSES_PICTURE
 from heatsplat.callbacks.metrics import TEST_FILE
 from heatsplat.callbacks.probes import PROBES_PICTURE
-from heatsplat.callbacks.report_words import COST_WORDS, DATA_WORDS, EFFECT_WORDS, RUN_WORDS, SETTING_WORDS, Words
+from heatsplat.callbacks.report_words import (
+    COST_WORDS,
+    DATA_WORDS,
+    EFFECT_WORDS,
+    RISE_WORDS,
+    RUN_WORDS,
+    SETTING_WORDS,
+    Words,
+)
 from heatsplat.callbacks.surfaces import SURFACES_FILE, SURFACES_PICTURE
 from heatsplat.callbacks.turntable import TURNTABLE_FILE
 from heatsplat.contracts import rounded
@@ -278,6 +286,8 @@ def _in_words(name: str, value: Any, known: Words) -> tuple[str, str]:
         known: what names are in words.
     """
     words, unit = known.get(name) or words_and_unit(name)
+    if name in RISE_WORDS and isinstance(value, float) and value < 0:
+        words, value = RISE_WORDS[name], -value
     if isinstance(value, Mapping):
         if name == "views":
             return words, ", ".join(f"{_words(count)} {PARTS.get(part, part)}" for part, count in value.items())

@@ -94,6 +94,9 @@ RUN_WORDS: Words = {
     "twice": ("by the plan", ""),
 }
 
+# Names whose words stand for a fall -> those for a rise, which a value below 0 is.
+RISE_WORDS = {"error_falls": "squared errors would rise by"}
+
 # Physical effects, as headings.
 EFFECT_WORDS: Mapping[str, str] = {
     "relaxation": "relaxation to the surroundings",

@@ -30,6 +30,7 @@ DEARER = 4.0  # factor on the price of Gaussians whose pair was taken apart agai
 WEIGHT, CHANGE = "weight", "change"  # statistics of the cloud that is worked on: see _weigh
 PAIRS = 1 << 15  # that are priced together: what is worked out of each takes 2 KB
 VIEWS = 16  # that are compared together, for every change of what is shown may cost a look at all cameras
+TOLD_SECONDS = 15.0  # between two lines that say how far merging is
 ORIGIN = "origin"  # statistic of the cloud that is worked on: 1 + place before merging, 0 for merged Gaussians
 
 
@@ -162,7 +163,7 @@ class _Search:
         count = len(splats)
         places = torch.arange(1, count + 1, device=splats.means.device)
         self.cloud = Cloud(splats, state={ORIGIN: places})
-        self.before, self.rounds = count, 0
+        self.before, self.rounds, self.told_at = count, 0, time.monotonic()
         self.wanted = [self._images(frame) for frame in self.frames]
         self.loss = _Loss(0.0, 0.0, dict.fromkeys(module.thermal.companions, 0.0))
 
@@ -177,6 +178,15 @@ class _Search:
             "rounds": self.rounds,
             "views": len(self.frames),
         }
+
+    def _tell(self, doing: str, views: int) -> None:
+        """Says how far the search is, unless it did so lately; ``views`` of its own are done in what it is doing."""
+        if time.monotonic() >= self.told_at + TOLD_SECONDS:
+            self.told_at = time.monotonic()
+            log.info(
+                "merging, round %d, %s (view %d of %d): %d Gaussians are left so far, %.4f °C are lost",
+                self.rounds, doing, views, len(self.frames), len(self.cloud), self.loss.rms_c,
+            )  # fmt: skip
 
     # Rounds ----------------------------------------------------------------------------------------------------------
 
@@ -235,6 +245,7 @@ class _Search:
                     (weighted,) = torch.autograd.grad((image * squares).sum(), [values])
                     blame = blame + weighted[-count:].double().sum(1)
                     total, pixels = total + squares.double().sum().item(), pixels + squares.numel()
+            self._tell("dealing out what changed", first + len(frames))
         return blame * (total / pixels / blame.sum().clamp(min=1e-300))
 
     # Which pairs -----------------------------------------------------------------------------------------------------
@@ -323,6 +334,7 @@ class _Search:
                 weight += by_value.double().square().sum(1)
                 # by o in units of o, of o = sigmoid(logit)
                 change += (by_logit.double() / (1 - logits.detach().double().sigmoid())).square().sum(1)
+                self._tell("weighing the Gaussians", i + 1)
         self.cloud.state |= {WEIGHT: _floored(weight), CHANGE: _floored(change)}
 
     # What is lost ----------------------------------------------------------------------------------------------------
@@ -339,13 +351,14 @@ class _Search:
         squares, largest = dict.fromkeys(names, 0.0), torch.zeros(0)
         most = pixels["clean"] - math.ceil(STRICT * pixels["clean"]) + 1
         with self.module.showing(splats):
-            for frame, wanted in zip(self.frames, self.wanted, strict=True):
+            for i, (frame, wanted) in enumerate(zip(self.frames, self.wanted, strict=True)):
                 for name, image in self._images(frame).items():
                     off = (image - wanted[name]).abs().flatten()
                     squares[name] += off.double().square().sum().item()
                     if name == "clean":
                         largest = torch.cat([largest.to(off), off])
                         largest = largest.topk(min(most, len(largest)), sorted=False).values
+                self._tell("comparing the images", i + 1)
         rms = {name: math.sqrt(squares[name] / pixels[name]) for name in names}
         return _Loss(self.span_k * rms.pop("clean"), self.span_k * largest.min().item(), rms)
 

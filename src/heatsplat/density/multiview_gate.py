@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, RenderOutput, SceneData, SceneError
+from heatsplat.contracts import Camera, RenderOutput, SceneData, SceneError, quantile
 from heatsplat.density.adaptive import Adaptive
 from heatsplat.density.base import DensityChange, ndc_gradient_norms
 from heatsplat.density.ops import Cloud
@@ -147,7 +147,7 @@ class MultiviewGate(Adaptive):
         self._mean_error = (
             float(counted.mean()) if len(counted) else 0.0
         )  # for ``observe``, which follows in the same step
-        largest = torch.quantile(counted, LARGEST) if len(counted) else error.new_zeros(())
+        largest = quantile(counted, LARGEST) if len(counted) else error.new_zeros(())
         return (error > (WRONG * largest).clamp(min=NOISES * self.noise))[..., None].to(error)
 
     @torch.no_grad()
@@ -185,7 +185,7 @@ class MultiviewGate(Adaptive):
     def _relative(self, cloud: Cloud, name: str, seen: Tensor) -> Tensor:
         """Mean of a gradient over the views that saw a Gaussian [N], in units of its quantile over the Gaussians."""
         mean = cloud.state[name] / cloud.state["seen"].clamp(min=1)
-        return mean / torch.quantile(mean[seen], self.grad_quantile).clamp(min=torch.finfo(mean.dtype).tiny)
+        return mean / quantile(mean[seen], self.grad_quantile).clamp(min=torch.finfo(mean.dtype).tiny)
 
     def _passes(self, state: dict[str, Tensor]) -> Tensor:
         """Which Gaussians pass the gate, [N] bool."""

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from heatsplat.contracts import quantile
 from heatsplat.density.adaptive import Adaptive
 from heatsplat.density.base import DensityChange
 from heatsplat.density.ops import Cloud
@@ -128,7 +129,7 @@ class Proximity(Adaptive):
         """Sources, lengths and ends of the edges to be populated, [n] each, n <= most; the highest scores first."""
         lengths, ends = proximity_graph(cloud.splats.means.detach(), self.neighbours)
         scores = lengths.mean(1) if lengths.shape[1] else lengths.new_zeros(len(lengths))
-        limit = torch.quantile(scores, self.quantile) if self.threshold is None else self.threshold * extent
+        limit = quantile(scores, self.quantile) if self.threshold is None else self.threshold * extent
         able = (cloud.splats.opacities >= self.min_opacity).any(dim=0) & (scores > (1.0 + EVEN) * limit)
         order = scores.argsort(descending=True, stable=True)
         order = order[able[order]]

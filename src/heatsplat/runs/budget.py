@@ -33,6 +33,7 @@ log = logging.getLogger("heatsplat")
 
 UNITS = {"": 1.0, "s": 1.0, "sec": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 MIN_STEPS = 100  # below, the schedule loses its shape: growth, which comes every 50 steps or more, has no time
+SPARE = 1.25  # times the least is what is advised: the next start measures anew, in a busier moment perhaps
 CALIBRATION_SHARE = 0.05  # of the budget at most
 CALIBRATION_SECONDS = 4.0  # and at most this long
 CALIBRATION_ROUNDS = (3, 200)  # fewest and most timed steps of each size; fewer than three have no middle
@@ -272,9 +273,11 @@ def plan(
     costs, train_s = RunCosts(outlook, pace, cap_max), asked_s - pace.spent_s
     least = min(costs.cost(choice, MIN_STEPS) for choice in outlook.choices)
     if train_s < least:
+        # In more time the calibration takes its share at most, or as long as here, where that is its fewest steps.
+        needed = max(least / (1 - CALIBRATION_SHARE), least + pace.spent_s)
         raise SceneError(
-            f"budget={asked_s:g}s is too short here: {MIN_STEPS} steps and their calibration take "
-            f"{math.ceil(10 * least / (1 - CALIBRATION_SHARE)) / 10:g} s on this machine. Give at least that, or make the scene "
+            f"budget={asked_s:g}s is too short here: {MIN_STEPS} steps and their calibration take {needed:.3g} s on this "
+            f"machine. Give budget={math.ceil(10 * SPARE * needed) / 10:g}s, which a busier moment may need, or make the scene "
             "smaller (data.downscale=2, init.count=10000)."
         )
     score, chosen, steps = costs.best(train_s)

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from heatsplat.composition import module_settings, overlap
+from heatsplat.composition import copied_settings, module_settings, overlap
 from heatsplat.contracts import SceneError, check_count
 from heatsplat.effects import assembly
 from heatsplat.io.command_lines import keys_of
@@ -73,13 +73,24 @@ def _check_as_composed(config: Mapping[str, Any]) -> None:
     for place, key in module_settings().items():
         if any(overlap(f"module.{place}", other) for other in given):
             continue
-        changed = _difference(key, at(config, key), at(config["module"], place))
-        if changed is not None:
-            name, value, composed = changed
-            raise SceneError(
-                f"{name} was changed after compose, from {composed} to {value}, and would not take effect: give it to "
-                f"compose, as in compose([..., '{name}={value}'])"
-            )
+        _refuse_change(key, at(config, key), at(config["module"], place))
+
+
+def check_copied(config: Mapping[str, Any]) -> None:
+    """Raises SceneError for a setting that was changed after composition, which had made others of it. It composes again: only
+    for a configuration that was in the hands of a program."""
+    for key, composed in copied_settings(config["overrides"]).items():
+        _refuse_change(key, at(config, key), composed)
+
+
+def _refuse_change(key: str, given: Any, composed: Any) -> None:
+    changed = _difference(key, given, composed)
+    if changed is not None:
+        name, value, before = changed
+        raise SceneError(
+            f"{name} was changed after compose, from {before} to {value}, and would not take effect: give it to "
+            f"compose, as in compose([..., '{name}={value}'])"
+        )
 
 
 def _difference(key: str, one: Any, other: Any) -> tuple[str, Any, Any] | None:

@@ -24,7 +24,7 @@ from heatsplat.doctor.examination import FINDINGS_FILE, warn_of, write_findings
 from heatsplat.geometry.coverage import Sighting, covered
 from heatsplat.io.results import RunResults, checkpoint_of
 from heatsplat.runs.budget import budgeted
-from heatsplat.runs.checks import check_last_stage, checked
+from heatsplat.runs.checks import check_copied, check_last_stage, checked
 from heatsplat.runs.declared import declared
 from heatsplat.runs.device import device_of
 from heatsplat.runs.folder import results_in
@@ -76,6 +76,7 @@ def train(config: dict[str, Any], output_dir: Path | str | None = None) -> RunRe
     """
     if not isinstance(config, dict) or "module" not in config:
         raise TypeError(f"train takes a configuration, such as heatsplat.compose(['method=etgs']), got {config!r}")
+    check_copied(config)
     if output_dir is None:
         data = config["data"]
         scene = scene_name("data", data.get("root"), data.get("scene"))

@@ -51,8 +51,8 @@ class GainControl(PerFrame):
         self.register_buffer("bounds", torch.tensor([math.log(stretch_max), shift_max]))
         self.raw = nn.Parameter(torch.zeros(0, 2))
 
-    def prepare(self, scene: SceneData) -> None:
-        super().prepare(scene)
+    def prepare(self, scene: SceneData, modality: str = "thermal") -> None:
+        super().prepare(scene, modality)
         self.raw = nn.Parameter(torch.zeros(len(self.frame_ids), 2))
 
     def forward(self, image: Tensor, frame: Frame) -> Tensor:

@@ -26,8 +26,12 @@ class SensorPart(nn.Module, ABC):
     weight: float = 0.0
     needs_depth: bool = False
 
-    def prepare(self, scene: SceneData) -> None:
-        """Takes sizes (number of frames, image shape) from the scene. Called once, before training."""
+    def prepare(self, scene: SceneData, modality: str = "thermal") -> None:
+        """Takes sizes (number of frames, image shape) from the scene. Called once, before training.
+
+        Args:
+            modality: of the images that the part makes, "thermal" or "rgb": a scene may have both.
+        """
         return
 
     @abstractmethod
@@ -63,9 +67,9 @@ class SensorChain(nn.Module):
         super().__init__()
         self.parts = nn.ModuleDict({name: part for name, part in (parts or {}).items() if part is not None})
 
-    def prepare(self, scene: SceneData) -> None:
+    def prepare(self, scene: SceneData, modality: str = "thermal") -> None:
         for part in self.parts.values():
-            part.prepare(scene)
+            part.prepare(scene, modality)
 
     @property
     def needs_depth(self) -> bool:

@@ -60,7 +60,7 @@ class Calibration(SensorPart):
         if self.raw_gain is not None:
             self.register_buffer("shared", torch.full((grid * grid, 1), 1.0 / grid))  # orthonormal columns
 
-    def prepare(self, scene: SceneData) -> None:
+    def prepare(self, scene: SceneData, modality: str = "thermal") -> None:
         if self.raw_gain is None:
             return
         camera = scene.train.frames[0].camera

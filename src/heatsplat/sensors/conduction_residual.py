@@ -67,7 +67,7 @@ class ConductionResidual(SensorPart):
             for parameter in (*(layer.bias for layer in self.layers), self.last.weight, self.last.bias):
                 parameter.zero_()
 
-    def prepare(self, scene: SceneData) -> None:
+    def prepare(self, scene: SceneData, modality: str = "thermal") -> None:
         self.trained_width.fill_(scene.train.frames[0].camera.width)
 
     def forward(self, image: Tensor, frame: Frame) -> Tensor:

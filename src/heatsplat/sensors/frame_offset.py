@@ -45,8 +45,8 @@ class FrameOffset(PerFrame):
         self.raw_offset = nn.Parameter(torch.zeros(0))
         self.raw_gain = nn.Parameter(torch.zeros(0)) if gain_max > 0 else None
 
-    def prepare(self, scene: SceneData) -> None:
-        super().prepare(scene)
+    def prepare(self, scene: SceneData, modality: str = "thermal") -> None:
+        super().prepare(scene, modality)
         self.raw_offset = nn.Parameter(torch.zeros(len(self.moments)))
         if self.raw_gain is not None:
             self.raw_gain = nn.Parameter(torch.zeros(len(self.moments)))

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Frame, SceneData, SceneError
+from heatsplat.contracts import Frame, SceneData, SceneError, quantile
 from heatsplat.sensors.per_frame import PerFrame
 
 LEAST_RISE = 1e-3  # between neighbouring quantiles, image units: maps stay reversible where an image is flat
@@ -20,8 +20,9 @@ class HistogramAlignment(PerFrame):
     then shows them with the histogram of its own. Nothing is learned, and nothing is lost: the map rises everywhere. An
     image that was not trained on gets what lies between its neighbours, as its own histogram is not known.
 
-    **Convention:** images that see different things have different histograms, too. Alignment of all of the difference
-    takes those for drift; ``strength`` below 1 takes part of it, and of a scene that changes it hides the change.
+    **Convention:** one map serves all channels, whose values make one histogram. Images that see different things have
+    different histograms, too. Alignment of all of the difference takes those for drift; ``strength`` below 1 takes part of it,
+    and of a scene that changes it hides the change.
 
     Args:
         quantiles: nodes of the map; at least 2.
@@ -39,15 +40,15 @@ class HistogramAlignment(PerFrame):
         self.register_buffer("own", torch.zeros(0, quantiles))  # of the training images in order of time
         self.register_buffer("shared", torch.zeros(quantiles))
 
-    def prepare(self, scene: SceneData) -> None:
-        super().prepare(scene)
+    def prepare(self, scene: SceneData, modality: str = "thermal") -> None:
+        super().prepare(scene, modality)
         shares = torch.linspace(0.0, 1.0, self.count)
         found = {}
         for view in scene.train:
-            values = view.image("thermal")
+            values = view.image(modality)
             values = values if view.mask is None else values[view.mask]
             unknown = not values.numel()  # its mask leaves none: the shared histogram stands for its own
-            found[view.frame.frame_id] = shares * torch.nan if unknown else values.flatten().float().quantile(shares)
+            found[view.frame.frame_id] = shares * torch.nan if unknown else quantile(values.flatten().float(), shares)
         rows = torch.stack([found[int(frame_id)] for frame_id in self.frame_ids])
         if rows.isnan().all():
             raise SceneError(f"masks leave no pixel of the training images of scene '{scene.name}'")

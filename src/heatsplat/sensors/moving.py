@@ -25,8 +25,8 @@ class MovingPart(PerFrame):
         super().__init__()
         self.register_buffer("twists", torch.zeros(0, 6, dtype=torch.float64))  # of the training images, in order
 
-    def prepare(self, scene: SceneData) -> None:
-        super().prepare(scene)
+    def prepare(self, scene: SceneData, modality: str = "thermal") -> None:
+        super().prepare(scene, modality)
         if not self.timed:
             raise SceneError(
                 f"scene '{scene.name}' has training views without a time, so nothing is known of how fast the camera moves: "

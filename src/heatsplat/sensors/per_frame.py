@@ -22,7 +22,7 @@ class PerFrame(SensorPart):
         self.register_buffer("frame_ids", torch.zeros(0, dtype=torch.int64))  # in the same order
         self.register_buffer("timed", torch.tensor(True))
 
-    def prepare(self, scene: SceneData) -> None:
+    def prepare(self, scene: SceneData, modality: str = "thermal") -> None:
         self.timed.fill_("time" in scene.metadata)
         frames = sorted(scene.train.frames, key=lambda frame: (self._moment(frame), frame.frame_id))
         self.moments = torch.tensor([self._moment(frame) for frame in frames], dtype=torch.float64)

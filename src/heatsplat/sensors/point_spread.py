@@ -44,7 +44,7 @@ class PointSpread(SensorPart):
         self.raw_spread = nn.Parameter(torch.zeros(()))
         self.register_buffer("trained_width", torch.ones((), dtype=torch.float64))  # of the images, in pixels
 
-    def prepare(self, scene: SceneData) -> None:
+    def prepare(self, scene: SceneData, modality: str = "thermal") -> None:
         self.trained_width.fill_(scene.train.frames[0].camera.width)
 
     def forward(self, image: Tensor, frame: Frame) -> Tensor:

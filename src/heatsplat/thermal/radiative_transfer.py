@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, check_numbers, check_option
+from heatsplat.contracts import SceneData, check_numbers, check_option, quantile
 from heatsplat.same_bits import everywhere, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.attenuation import Attenuation
@@ -93,7 +93,7 @@ class RadiativeTransfer(Wrapper):
 
     def per_gaussian(self, seeds: Seeds) -> dict[str, PerGaussian]:
         if self.level.isnan():
-            self.level.copy_(seeds.values[:, 0].quantile(self.quantile))
+            self.level.copy_(quantile(seeds.values[:, 0], self.quantile))
         zeros = seeds.values.new_zeros(len(seeds.means))
         return super().per_gaussian(seeds) | {
             "emissivity_offset": PerGaussian(zeros, self.lr_emissivity, l2=self.emissivity_l2, l2_mean=True),

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, SceneError, evenly_spread
+from heatsplat.contracts import SceneData, SceneError, evenly_spread, quantile
 from heatsplat.geometry.neighbours import neighbour_distances
 from heatsplat.geometry.rotations import matrices_to_quats
 from heatsplat.geometry.surfaces import plane_thickness
@@ -253,7 +253,7 @@ def _check_world(path: Path, means: Tensor, scene: SceneData) -> None:
             "init.path=%s: training views see %.2g %% of its Gaussians, which may be of another world: %s",
             path, 100 * share, remedy,
         )  # fmt: skip
-    low, high = torch.quantile(means.float(), torch.tensor([0.01, 0.99]), dim=0)
+    low, high = quantile(means.float(), torch.tensor([0.01, 0.99]))
     size, own = float((high - low).max()), scene.bulk[1]
     if "points_random" not in scene.notes and not 1 / ANOTHER_SIZE < size / own < ANOTHER_SIZE:
         log.warning(

@@ -147,7 +147,7 @@ class SplatTraining(SceneModel):
         self._check_parts()
         self.scene = scene
         self.thermal.prepare(scene)
-        self.sensor.prepare(scene)
+        self.sensor.prepare(scene, self.modality)
         self.composite.prepare(scene, self.modality)
         self.cameras.prepare(scene)
         self.splats, self._declared = self.init(scene, self.thermal, self.seed, self.density.cap_max)

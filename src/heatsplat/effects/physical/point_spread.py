@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from heatsplat.contracts import quantile
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
 
@@ -33,7 +34,7 @@ def evidence(inspected: Inspection) -> Evidence:
     if len(widths) < MIN_EDGES:
         why = f"cannot be told: only {len(widths)} edges stand out of the noise, {MIN_EDGES} are needed"
         return Evidence(None, why, told=False)
-    sigma = float(widths.quantile(0.5 * SHARPEST))
+    sigma = float(quantile(widths, 0.5 * SHARPEST))
     spread = math.sqrt(max(sigma**2 - PIXEL_PX**2, 0.0))
     found = (
         f"the sharpest tenth of {len(widths)} edges has a width (standard deviation) of {sigma:.2f} pixels, {spread:.2f} beyond "

@@ -13,7 +13,7 @@ import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numbers
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numbers, quantile
 from heatsplat.export.formats.base import Format, extra_columns, optional
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import AUTO, Place, place_in_file
@@ -155,7 +155,7 @@ class Map(Format):
             pixel = place.scale * float(np.median([(c.center - middle).norm() / c.K[0, 0] for c in cameras]))
             pixel = float(f"{pixel:.2g}")
         if self.bounds is None:
-            low, high = (torch.quantile(points, share, dim=0) for share in (0.005, 0.995))
+            low, high = (quantile(points, share) for share in (0.005, 0.995))
             around = MARGIN * float((high - low).max())
             west, south, east, north = *(low - around).tolist(), *(high + around).tolist()
         else:
