@@ -48,7 +48,9 @@ def test_a_gaussian_lies_in_the_plane_of_its_neighbours_and_is_as_thick_as_they_
     )
     assert torch.equal(planes.scales[:, :2], balls.scales[:, :2])  # as wide
     shares = (planes.scales / balls.scales)[:, 2].detach()
-    assert torch.allclose(shares[:2000], torch.tensor(0.1)) and 0.5 < shares[2000:].median() < 0.8 and shares.max() <= 1.0
+    assert (
+        torch.allclose(shares[:2000], torch.tensor(0.1)) and 0.5 < shares[2000:].median() < 0.8 and shares.max() <= 1.0
+    )
     thin = quats_to_matrices(planes.quats)[:2000, :, 2].detach()
     assert (thin @ normal).abs().min() > 0.99
     assert torch.equal(balls.quats, torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4000, 4))

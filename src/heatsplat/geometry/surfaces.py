@@ -9,8 +9,9 @@ from torch import Tensor
 from heatsplat.contracts import Camera
 from heatsplat.geometry.coverage import surface_depth
 
-
-LEAST_WIDTH = 1e-3  # second semi-axis of a neighbourhood in its first, below which its points lie on a line and make no plane
+LEAST_WIDTH = (
+    1e-3  # second semi-axis of a neighbourhood in its first, below which its points lie on a line and make no plane
+)
 
 
 def plane_axes(points: Tensor, at: Tensor, neighbours: int) -> tuple[Tensor, Tensor]:
