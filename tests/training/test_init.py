@@ -63,9 +63,12 @@ def test_points_on_a_line_start_as_balls(parts):
     assert torch.equal(splats.scales, splats.scales[:, :1].expand(-1, 3)) and splats.quats.isfinite().all()
 
 
-@pytest.mark.parametrize(("recipe", "thinnest"), [([], 0.1), (["recipe=published"], 1.0), (["init=random"], 1.0)])
-def test_published_and_drawn_gaussians_start_as_balls(recipe, thinnest):
-    assert compose(["method=etgs", *recipe])["init"]["thinnest"] == thinnest
+@pytest.mark.parametrize(
+    ("recipe", "start"), [([], (0.1, 0.6)), (["recipe=published"], (1.0, 0.1)), (["init=random"], (1.0, 0.1))]
+)
+def test_published_and_drawn_gaussians_start_as_faint_balls(recipe, start):
+    init = compose(["method=etgs", *recipe])["init"]
+    assert (init["thinnest"], init["opacity"]) == start
 
 
 @pytest.mark.parametrize(
