@@ -33,6 +33,7 @@ GAUSSIANS = {  # 3D Gaussian Splatting, arguments/__init__.py of the authors' co
     "renderer.background": (0.0, "train.py: bg_color is black unless --white_background"),
     "init.opacity": (0.1, "create_from_pcd"),
     "init.scale": (1.0, "create_from_pcd: the distance to three neighbours"),
+    "init.thinnest": (1.0, "create_from_pcd: repeat(1, 3)"),
 }
 GROWTH = {
     "start": (500, "densify_from_iter"),
