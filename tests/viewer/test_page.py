@@ -223,6 +223,21 @@ def test_probes_agree_with_the_renderer_at_ten_points_and_three_times(page, trai
         assert blended == pytest.approx(exact, abs=0.1)
 
 
+def test_visible_light_is_as_transparent_as_heat_of_the_same_opacities(new_page):
+    """Thin Gaussians, which a pixel that averages over its area makes fainter; the renderer does so in every modality."""
+    heat, light = new_page.execute_script("""const v = viewer, s = v.splats, {width, height} = v.drawing.gl.canvas;
+      s.scales = s.scales.map((scale) => 0.25 * scale);
+      Object.assign(s, {colours: new Uint8Array(3 * s.count).fill(200), colourOpacities: s.opacities});
+      const scene = Object.assign(v.drawing.load(s), {ids: v.scene.ids, array: v.scene.array, seen: v.scene.seen, ready: true});
+      return [['first', false], ['visible', true]].map(([name, coloured]) => {
+        v.drawing.blend(scene, v.view, name, coloured);
+        return Array.from(v.drawing.read(name, 0, 0, width, height).filter((_, i) => i % 4 === 3));
+      });""")
+    assert new_page.execute_script("return viewer.told.renderer.antialiased") is True
+    assert 0.02 < np.mean(heat) < 0.9
+    np.testing.assert_allclose(light, heat, atol=1e-6)
+
+
 def test_the_slider_changes_the_picture(page):
     before = pixels(page)
     slider = page.find_element("id", "time")

@@ -38,7 +38,7 @@ void main() {
   vec3 normal = cross(u, v);
   float sharp = dot(normal, normal), det = sharp + eps2d * (uu + vv) + eps2d * eps2d;
   opacity = coloured ? size.w : place.w;
-  if (antialiased && !coloured) opacity *= sqrt(sharp / det);
+  if (antialiased) opacity *= sqrt(sharp / det);
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside
   if (!(opacity >= 1.0 / 255.0) || !(det > 0.0)) return;
   float extent = sqrt(2.0 * log(255.0 * opacity));
