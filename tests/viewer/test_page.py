@@ -17,6 +17,7 @@ from viewer.test_payload import in_units
 from heatsplat.callbacks.viewer import ViewerPage
 from heatsplat.contracts import SceneError, ViewSet, evenly_spread
 from heatsplat.io.tables import read_csv
+from heatsplat.renderers.settings import Renderer
 from heatsplat.runs.run import load
 from heatsplat.viewer import page as pages
 from heatsplat.viewer.page import FILE, write_viewer
@@ -236,6 +237,24 @@ def test_visible_light_is_as_transparent_as_heat_of_the_same_opacities(new_page)
     assert new_page.execute_script("return viewer.told.renderer.antialiased") is True
     assert 0.02 < np.mean(heat) < 0.9
     np.testing.assert_allclose(light, heat, atol=1e-6)
+
+
+def test_gaussians_are_as_wide_as_the_renderer_draws_them_on_pixels_of_any_size(page, trained, monkeypatch):
+    """Beside a pixel of a training image lie ``finer`` of those that training rendered, and ``scale`` of the canvas."""
+    asked, camera = [], trained.scene.train.frames[0].camera
+    monkeypatch.setattr("heatsplat.renderers.settings.rasterization", lambda *_, eps2d, **__: asked.append(eps2d))
+    sizes = [(finer, scale) for finer in (1, 4) for scale in (0.3, 0.5, 1.0, 3.0, 4.0) if scale <= finer]
+    for settings in ({"eps2d": 1 / 12, "antialiased": True}, {"eps2d": 0.3, "antialiased": False}):
+        renderer = Renderer("cpu", **settings)
+        shapes = [torch.zeros(1, 3), torch.zeros(1, 4), torch.ones(1, 3), torch.ones(1, 1), torch.zeros(1, 1)]
+        for finer, scale in sizes:
+            renderer(*shapes, camera, None, (1,), ratio=finer / scale)
+        script = "return arguments[1].map(([finer, scale]) => blurOn({...arguments[0], finer}, scale));"
+        assert page.execute_script(script, settings, sizes) == pytest.approx(asked, rel=1e-9)
+        asked.clear()
+    assert page.execute_script("return blurOn({eps2d: 0.3, antialiased: false}, 2)") == pytest.approx(
+        1.2
+    )  # an older page
 
 
 def test_the_slider_changes_the_picture(page):
