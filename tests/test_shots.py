@@ -208,6 +208,18 @@ def test_a_setting_that_makes_no_shot_is_named(settings, told):
         shot_frames(make_scene(), **{"trajectory": "view", **settings})
 
 
+def test_moving_cameras_and_a_view_have_finer_pixels_where_training_rendered_them():
+    scene = make_scene()
+    for trajectory in ("view", "path"):
+        (taken,), (finer,) = (shot_frames(scene, trajectory, 0.0, 0, 1, finer=finer) for finer in (1, 4))
+        assert (finer.camera.width, finer.camera.height) == (4 * taken.camera.width, 4 * taken.camera.height)
+        assert torch.equal(finer.camera.K[:2], 4 * taken.camera.K[:2])
+        assert torch.equal(finer.camera.viewmat, taken.camera.viewmat)
+    for trajectory in ("train", "test"):
+        frames = getattr(scene, trajectory).frames
+        assert [f.camera for f in shot_frames(scene, trajectory, finer=4)] == [f.camera for f in frames]
+
+
 def test_a_camera_that_stands_still_has_no_orbit_but_a_path():
     scene = make_scene()
     with pytest.raises(SceneError, match="give no orbit; choose trajectory=path or view instead"):

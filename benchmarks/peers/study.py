@@ -137,7 +137,7 @@ def _trainings(
     for name, train_one, count in filter(None, chain.from_iterable(turns)):
         load = os.getloadavg()[0]
         done = train_one(count, threads, folder / re.sub(r"\W+", "_", f"{name}_{count}"))
-        found, gaussians = score(done.ply, scene)
+        found, gaussians = score(done, scene)
         log.info("%s, %d steps, %d thread(s): %.2f dB in %.1f s", name, count, threads, found, done.training_s)
         row = {"threads": threads, "program": name, "peer": name in theirs, "steps": count, "gaussians": gaussians}
         rows.append(row | {"psnr": found, "training_s": done.training_s, "process_s": done.process_s, "load": load})

@@ -11,8 +11,9 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -44,11 +45,13 @@ class Trained:
         ply: what it exported.
         training_s: seconds from its first step to its last.
         process_s: seconds of the whole process, which starts, reads the scene, trains and writes.
+        blur: settings of ``rasterization`` by which its Gaussians cover pixels; none for those of 3DGS.
     """
 
     ply: Path
     training_s: float
     process_s: float
+    blur: Mapping[str, Any] = field(default_factory=dict)
 
 
 def train_heatsplat(
@@ -66,14 +69,16 @@ def train_heatsplat(
     process_s = _run(command, threads, {}, lambda line: None)
     checkpoint = folder / "checkpoints" / "last.ckpt"
     clock = load_checkpoint(checkpoint)["callbacks"]["CostMeter"]["seconds"]
-    splats = {name: raw.detach() for name, raw in load(checkpoint, output_dir=folder).module.splats.raw.items()}
+    module = load(checkpoint, output_dir=folder).module
+    splats = {name: raw.detach() for name, raw in module.splats.raw.items()}
     write_splats(
         folder / "splats.ply",
         *(splats[name] for name in GEOMETRY),
         values=0.5 + spherical_harmonics.C0 * splats["sh0"][:, 0],
         sh_rest=splats.get("sh_rest"),
     )
-    return Trained(folder / "splats.ply", sum(clock.values()), process_s)
+    blur = {"eps2d": module.renderer.eps2d, "antialiased": module.renderer.antialiased}
+    return Trained(folder / "splats.ply", sum(clock.values()), process_s, blur)
 
 
 def train_opensplat(
@@ -147,12 +152,13 @@ def _on_cores(count: int) -> Iterator[None]:
 
 
 @torch.no_grad()
-def score(ply: Path, scene: SharedScene) -> tuple[float, int]:
-    """Mean PSNR in dB of a PLY file over the held-out views, drawn by heatsplat's renderer, and its number of Gaussians.
+def score(done: Trained, scene: SharedScene) -> tuple[float, int]:
+    """Mean PSNR in dB of what a training exported over the held-out views, and its number of Gaussians.
 
-    Of a grey scene the mean of the three channels is scored.
+    heatsplat's renderer draws it, with the blur that it was trained with. Of a grey scene the mean of the three channels is
+    scored.
     """
-    found = {name: torch.from_numpy(array) for name, array in read_splats(ply).items()}
+    found = {name: torch.from_numpy(array) for name, array in read_splats(done.ply).items()}
     shape = found["means"], found["quats"], found["log_scales"].exp(), found["opacity_logits"][:, 0].sigmoid()
     constant = (found["values"] - 0.5)[:, None] / spherical_harmonics.C0
     coefficients = torch.cat([constant, found["sh_rest"]], 1) if "sh_rest" in found else constant
@@ -162,7 +168,7 @@ def score(ply: Path, scene: SharedScene) -> tuple[float, int]:
         directions = found["means"] - camera.center.float()
         colors = (0.5 + spherical_harmonics.evaluate(coefficients, directions, degree)).clamp(min=0)
         size = camera.width, camera.height
-        seen = rasterization(*shape, colors, camera.viewmat, camera.K, *size, backend="cpu", depth=False)
+        seen = rasterization(*shape, colors, camera.viewmat, camera.K, *size, backend="cpu", depth=False, **done.blur)
         picture = seen.features.clamp(0, 1)
         if image.shape[-1] == 1:
             picture = picture.mean(-1, keepdim=True)

@@ -318,7 +318,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     if config["video"]:
         encoder(config["codec"])  # what is missing is told before anything is rendered
     trained = _load(config, output_dir)
-    frames = shot_frames(trained.scene, **shot)
+    frames = shot_frames(trained.scene, **shot, finer=trained.module.supersample)
     warn_beyond_record(trained.scene, frames, trained.module.thermal.beyond_record)
     for name in names:
         check_option("images", name, ("all", *trained.image_names), SceneError)

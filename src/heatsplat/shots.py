@@ -35,6 +35,7 @@ def shot_frames(
     time: float | Sequence[float] | None = None,
     view: int | str = 0,
     count: int = 60,
+    finer: int = 1,
 ) -> list[Frame]:
     """The frames of a shot, in order.
 
@@ -47,6 +48,7 @@ def shot_frames(
             path).
         view: for "view": position among the training frames, or file name.
         count: frames of "orbit", "path" and "view".
+        finer: how many of their pixels lie beside one of a training image (super-resolution); "test" and "train" are as taken.
 
     Raises:
         SceneError: a setting that ``check_shot`` refuses, an unknown view, or no orbit where all cameras look along one line.
@@ -67,6 +69,7 @@ def shot_frames(
     else:
         cameras = _moving(scene, trajectory, count)
         time = scene.middle_s if time is None else time
+    cameras = [camera.resized(finer * camera.width, finer * camera.height) for camera in cameras]
     moments = [None] * count if time is None else _moments(time, count)
     return [
         at_time(scene, Frame(str(name.with_stem(f"{name.stem}_{i:04d}")), first_free + i, camera), moment)

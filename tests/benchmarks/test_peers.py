@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+import heatsplat
 from benchmarks.peers import rasterisers, study, training
 from benchmarks.peers.report import equal_psnr, seconds_to
 from benchmarks.peers.scenes import PointScene, shared
@@ -20,6 +21,7 @@ from heatsplat.datamodules.formats.images import read_image
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.geometry.neighbours import neighbour_distances
 from heatsplat.io.ply import write_splats
+from heatsplat.metrics.psnr import psnr
 
 ROOT = Path(__file__).resolve().parents[2]
 TILES = "benchmarks.renderer.peers:render_torch_tiles"
@@ -138,9 +140,31 @@ def splats_of(scene, path, shift=0.0):
 
 def test_a_file_of_the_true_splats_scores_as_well_as_8_bits_allow(garden, tmp_path):
     scene = shared(garden.scene, tmp_path)
-    good, count = training.score(splats_of(garden, tmp_path / "true.ply"), scene)
-    worse, _ = training.score(splats_of(garden, tmp_path / "off.ply", shift=0.05), scene)
+    good, count = training.score(training.Trained(splats_of(garden, tmp_path / "true.ply"), 0.0, 0.0), scene)
+    worse, _ = training.score(training.Trained(splats_of(garden, tmp_path / "off.ply", shift=0.05), 0.0, 0.0), scene)
     assert count == 300 and good > 55 and 20 < worse < 45
+
+
+def test_splats_are_scored_with_the_blur_that_they_were_trained_with(garden, tmp_path, monkeypatch):
+    """Thin ones, whose images depend on it."""
+
+    def train_here(command, *_):
+        heatsplat.train(heatsplat.compose([*command[2:], "init.scale=0.1"]), tmp_path / "run")
+        return 1.0
+
+    monkeypatch.setattr(training, "_run", train_here)
+    scene = shared(garden.scene, tmp_path)
+    recipe = ["method=3dgs", "thermal.modality=rgb", "thermal.channels=3", "doctor=false"]
+    done = training.train_heatsplat("train.py", scene, recipe, 3, 1, tmp_path / "run")
+    found, _ = training.score(done, scene)
+    trained = heatsplat.load(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    frames = trained.scene.test.frames
+    own = np.mean(
+        [psnr(trained.module.predict(frame), image) for frame, image in zip(frames, scene.images, strict=True)]
+    )
+    assert found == pytest.approx(own, abs=0.01)
+    wider, _ = training.score(replace(done, blur={}), scene)
+    assert abs(wider - own) > 0.1
 
 
 # ---- equal PSNR ----

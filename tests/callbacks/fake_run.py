@@ -96,7 +96,7 @@ class FakeModule(pl.LightningModule):
         self.modality = "thermal" if scene.train[0].thermal is not None else "rgb"
         self.channels = scene.train[0].image(self.modality).shape[-1]
         self.results, self.density_change = RunResults(), None
-        self.schedule = Schedule(8)
+        self.schedule, self.supersample = Schedule(8), 1
         self.value = torch.nn.Parameter(torch.tensor(0.9))
         self.poison = poison or {}
         self.calls = 0

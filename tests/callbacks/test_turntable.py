@@ -34,3 +34,18 @@ def test_what_is_hotter_than_the_bar_is_told(tmp_path, monkeypatch):
     panel, title = shown[0]
     assert panel.bar.above and not panel.bar.below
     assert panel.title.startswith("100 % above 4") and title == "240.0 s"
+
+
+def test_runs_that_render_finer_than_their_images_turn_as_fine(tmp_path):
+    sizes = []
+
+    def predict(frame):
+        sizes.append((frame.camera.width, frame.camera.height))
+        return torch.full((frame.camera.height, frame.camera.width, 1), 0.5)
+
+    for finer in (1, 4):
+        module = FakeModule(wall(), tmp_path)
+        module.predict, module.supersample = predict, finer
+        Turntable(frames=1, size=4096).on_test_epoch_end(None, module)
+    camera = wall().train.frames[0].camera
+    assert sizes == [(camera.width, camera.height), (4 * camera.width, 4 * camera.height)]

@@ -17,6 +17,7 @@ from viewer.test_payload import in_units
 from heatsplat.callbacks.viewer import ViewerPage
 from heatsplat.contracts import SceneError, ViewSet, evenly_spread
 from heatsplat.io.tables import read_csv
+from heatsplat.renderers.settings import Renderer
 from heatsplat.runs.run import load
 from heatsplat.viewer import page as pages
 from heatsplat.viewer.page import FILE, write_viewer
@@ -221,6 +222,39 @@ def test_probes_agree_with_the_renderer_at_ten_points_and_three_times(page, trai
     for x, y in points:  # what the cursor reads: the canvas's own pixel, in single precision
         blended, exact = page.execute_script(cursor, x + 0.5, y + 0.5)
         assert blended == pytest.approx(exact, abs=0.1)
+
+
+def test_visible_light_is_as_transparent_as_heat_of_the_same_opacities(new_page):
+    """Thin Gaussians, which a pixel that averages over its area makes fainter; the renderer does so in every modality."""
+    heat, light = new_page.execute_script("""const v = viewer, s = v.splats, {width, height} = v.drawing.gl.canvas;
+      s.scales = s.scales.map((scale) => 0.25 * scale);
+      Object.assign(s, {colours: new Uint8Array(3 * s.count).fill(200), colourOpacities: s.opacities});
+      const scene = Object.assign(v.drawing.load(s), {ids: v.scene.ids, array: v.scene.array, seen: v.scene.seen, ready: true});
+      return [['first', false], ['visible', true]].map(([name, coloured]) => {
+        v.drawing.blend(scene, v.view, name, coloured);
+        return Array.from(v.drawing.read(name, 0, 0, width, height).filter((_, i) => i % 4 === 3));
+      });""")
+    assert new_page.execute_script("return viewer.told.renderer.antialiased") is True
+    assert 0.02 < np.mean(heat) < 0.9
+    np.testing.assert_allclose(light, heat, atol=1e-6)
+
+
+def test_gaussians_are_as_wide_as_the_renderer_draws_them_on_pixels_of_any_size(page, trained, monkeypatch):
+    """Beside a pixel of a training image lie ``finer`` of those that training rendered, and ``scale`` of the canvas."""
+    asked, camera = [], trained.scene.train.frames[0].camera
+    monkeypatch.setattr("heatsplat.renderers.settings.rasterization", lambda *_, eps2d, **__: asked.append(eps2d))
+    sizes = [(finer, scale) for finer in (1, 4) for scale in (0.3, 0.5, 1.0, 3.0, 4.0) if scale <= finer]
+    for settings in ({"eps2d": 1 / 12, "antialiased": True}, {"eps2d": 0.3, "antialiased": False}):
+        renderer = Renderer("cpu", **settings)
+        shapes = [torch.zeros(1, 3), torch.zeros(1, 4), torch.ones(1, 3), torch.ones(1, 1), torch.zeros(1, 1)]
+        for finer, scale in sizes:
+            renderer(*shapes, camera, None, (1,), ratio=finer / scale)
+        script = "return arguments[1].map(([finer, scale]) => blurOn({...arguments[0], finer}, scale));"
+        assert page.execute_script(script, settings, sizes) == pytest.approx(asked, rel=1e-9)
+        asked.clear()
+    assert page.execute_script("return blurOn({eps2d: 0.3, antialiased: false}, 2)") == pytest.approx(
+        1.2
+    )  # an older page
 
 
 def test_the_slider_changes_the_picture(page):

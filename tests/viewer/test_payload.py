@@ -143,3 +143,11 @@ def test_a_camera_that_was_learned_stands_beside_what_it_recorded(tmp_path):
         matrix = torch.tensor(told["viewmat"], dtype=torch.float64).view(3, 4)
         assert torch.equal(matrix, module.cameras.of(frame).viewmat[:3].detach())
         assert (matrix - frame.camera.viewmat[:3]).abs().max() > 1e-3
+
+
+def test_a_page_tells_the_blur_and_how_much_finer_than_images_training_rendered(tmp_path):
+    for method, finer in (("3dgs", 1), ("direct_3dgs", 4)):
+        module = started(tmp_path / method, f"method={method}", "data.scene=noisy_sensor")
+        header, _ = payload(module, snapshot(module), cameras=1)
+        told = header["renderer"]
+        assert (told["antialiased"], told["finer"]) == (True, finer) and told["eps2d"] == pytest.approx(1 / 12)

@@ -32,10 +32,11 @@ class Turntable(pl.Callback):
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         scene, known = module.scene, module.scene.range_of(module.modality)
+        shot = {"count": self.frames, "finer": module.supersample}
         try:
-            frames = shot_frames(scene, "orbit", count=self.frames)
+            frames = shot_frames(scene, "orbit", **shot)
         except ValueError:  # all cameras on one line of sight
-            frames = shot_frames(scene, "path", count=self.frames)
+            frames = shot_frames(scene, "path", **shot)
         bar = Bar(*scene_bounds(scene, module.modality), bar_unit(known))
         shown = []
         for frame in frames:

@@ -93,6 +93,7 @@ def payload(module: Any, seen: Snapshot, cameras: int) -> tuple[dict[str, Any], 
         "renderer": {
             "eps2d": renderer.eps2d,
             "antialiased": renderer.antialiased,
+            "finer": module.supersample,
             "near": renderer.near,
             "far": renderer.far,
         },

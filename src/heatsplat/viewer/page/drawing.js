@@ -38,7 +38,7 @@ void main() {
   vec3 normal = cross(u, v);
   float sharp = dot(normal, normal), det = sharp + eps2d * (uu + vv) + eps2d * eps2d;
   opacity = coloured ? size.w : place.w;
-  if (antialiased && !coloured) opacity *= sqrt(sharp / det);
+  if (antialiased) opacity *= sqrt(sharp / det);
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside
   if (!(opacity >= 1.0 / 255.0) || !(det > 0.0)) return;
   float extent = sqrt(2.0 * log(255.0 * opacity));
@@ -146,6 +146,14 @@ void main() {
   else if (other != NOTHING && corner.x > split) shown = paint(map, beside, range, other == RECORDED ? 1.0 : alpha);
   else shown = paint(map, value, range, alpha);
 }`;
+
+// Pixels² of a canvas by which splats are widened where a training image's pixel is ``scale`` of its pixels wide. The blur is that
+// of the pixels that training rendered, ``finer`` of which lie beside a pixel of an image (super-resolution); a coarser pixel
+// also averages what lies in it (renderers/settings). Older pages do not tell how fine.
+function blurOn({ eps2d, antialiased, finer = 1 }, scale) {
+  const side = scale / finer;
+  return eps2d * side * side + (antialiased && side < 1 ? (1 - side * side) / 12 : 0);
+}
 
 const OTHERS = { nothing: 0, same: 1, run: 2, visible: 3, recorded: 4, sensor: 5 };
 const WIDTH = 2048;
@@ -285,10 +293,7 @@ class Drawing {
     gl.useProgram(program);
     const { camera, scale, left, top } = view;
     const [fx, fy, cx, cy] = camera.intrinsics;
-    const { eps2d, antialiased } = scene.splats.told.renderer;
-    // The blur is that of the training images' pixels; a coarser pixel also averages what lies in it (renderers/settings).
-    let blur = eps2d * scale * scale;
-    if (antialiased && scale < 1) blur += (1 - scale * scale) / 12;
+    const { antialiased } = scene.splats.told.renderer, blur = blurOn(scene.splats.told.renderer, scale);
     const margin = FOV_MARGIN * 0.5;
     const edges = [Math.min(-cx - margin * camera.width, -cx - left / scale) / fx,
       Math.max(camera.width - cx + margin * camera.width, (width - left) / scale - cx) / fx,
