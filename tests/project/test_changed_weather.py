@@ -47,6 +47,7 @@ def shoot(monkeypatch, folder: Path, needs: set[str], *overrides: str):
         thermal=heat,
         predict_all=predict_all,
         modality="thermal",
+        supersample=1,
         sensor=SimpleNamespace(parts={}),
         renderer=SimpleNamespace(backend="auto"),
         render=lambda frame: None,
