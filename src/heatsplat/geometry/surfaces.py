@@ -9,9 +9,8 @@ from torch import Tensor
 from heatsplat.contracts import Camera
 from heatsplat.geometry.coverage import surface_depth
 
-LEAST_WIDTH = (
-    1e-3  # second semi-axis of a neighbourhood in its first, below which its points lie on a line and make no plane
-)
+# Second semi-axis of a neighbourhood, as a share of its first, below which its points lie on a line and make no plane.
+LEAST_WIDTH = 1e-3
 
 
 def plane_axes(points: Tensor, at: Tensor, neighbours: int) -> tuple[Tensor, Tensor]:
@@ -29,25 +28,32 @@ def plane_axes(points: Tensor, at: Tensor, neighbours: int) -> tuple[Tensor, Ten
 
 
 def plane_thickness(points: Tensor, at: Tensor, neighbours: int) -> tuple[Tensor, Tensor]:
-    """The axes of ``plane_axes`` [n, 3, 3], and how thick neighbourhoods are across their planes [n], as a share of their
-    narrower width in them: 0 where points lie in a plane, 0.7 where ten are anywhere, and 1 where they lie on a line."""
-    axes, variances, _ = _principal_axes(points, at, neighbours)
-    widest, wide, thin = variances.unbind(1)
+    """The axes of ``plane_axes``, and how thick neighbourhoods are across their planes.
+
+    Returns:
+        Rotations [n, 3, 3] float64, as there; and shares [n] float64, in [0, 1], of the standard deviation across a plane in the
+        smaller one in it: 0 where points lie in a plane, about 0.7 where ten lie anywhere, and 1 where they lie on a line.
+
+    Args:
+        points: [P, 3]. at: [n, 3]. neighbours: as there.
+    """
+    axes, squares, _ = _principal_axes(points, at, neighbours)
+    widest, wide, thin = squares.unbind(1)
     flat = wide > LEAST_WIDTH**2 * widest
     return axes, torch.where(flat, thin / torch.where(flat, wide, 1.0), 1.0).sqrt()
 
 
 def _principal_axes(points: Tensor, at: Tensor, neighbours: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Axes [n, 3, 3] of the points nearest to each of ``at``, their variances [n, 3] along them, and distances [n]."""
+    """Axes [n, 3, 3] of the points nearest to each of ``at``, sums of squares [n, 3] along them, and distances [n]."""
     distances, near = cKDTree(points.double().numpy()).query(at.double().numpy(), k=min(neighbours, len(points)))
     around = points.double()[torch.from_numpy(near).reshape(len(at), -1)]
     around = around - around.mean(1, keepdim=True)
-    variances, axes = torch.linalg.eigh(around.mT @ around / around.shape[1])
+    squares, axes = torch.linalg.eigh(around.mT @ around)
     axes = axes.flip(-1)
     turn = torch.ones(len(at), 3, dtype=torch.float64)
     turn[:, 2] = torch.linalg.det(axes).sign()
     far = torch.from_numpy(distances).reshape(len(at), -1).square().mean(1).sqrt()
-    return axes * turn[:, None], variances.flip(-1).clamp(min=0.0), far
+    return axes * turn[:, None], squares.flip(-1).clamp(min=0.0), far
 
 
 def on_the_side_of(normals: Tensor, directions: Tensor) -> Tensor:
