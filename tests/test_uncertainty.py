@@ -12,7 +12,7 @@ from weathered import CAMERA
 
 from heatsplat import uncertainty
 from heatsplat.composition import build
-from heatsplat.contracts import Frame, SceneError, View, ViewSet
+from heatsplat.contracts import Camera, Frame, SceneError, View, ViewSet
 from heatsplat.renderers.base import rasterization
 from heatsplat.uncertainty import (
     WITHIN,
@@ -23,6 +23,7 @@ from heatsplat.uncertainty import (
     _shares,
     evidence,
     redundancy,
+    shown,
 )
 
 FRAME = Frame("a", 0, CAMERA, 0.0)
@@ -57,6 +58,7 @@ def test_evidence_is_that_of_least_squares(count):
     normal = views * weights.T @ weights
     assert torch.allclose(found.weight, normal.sum(1), rtol=1e-5)
     assert torch.allclose(found.misfit, torch.full((count,), 0.25, dtype=torch.float64))
+    assert torch.equal(shown(module, [seen] * views), found.weight)
     # What the camera sees of a temperature that all share has the variance of least squares, α² / Σ α², with noise of 1.
     alpha = weights.sum(1)
     exact = alpha / (views * alpha.square().sum()).sqrt()
@@ -65,6 +67,22 @@ def test_evidence_is_that_of_least_squares(count):
     assert (told >= exact * (1 - 1e-5)).all() and (told <= high * exact).all()
     masked = evidence(module, [replace(seen, mask=torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool))])
     assert (masked.weight == 0).all()
+
+
+def test_what_hides_behind_others_is_not_shown_however_large():
+    camera = Camera(torch.eye(4), torch.tensor([[20.0, 0.0, 4.0], [0.0, 20.0, 4.0], [0.0, 0.0, 1.0]]), 8, 8)
+    means = torch.tensor([[0.0, 0.0, depth] for depth in (20.0, 25.0, 500.0)])
+    quats, opacities = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3, 1), torch.full((3,), 0.99)
+    scales = torch.tensor([[15.0, 15.0, 0.1], [15.0, 15.0, 0.1], [2000.0, 2000.0, 0.1]])
+
+    def composited(frame, values):
+        return rasterization(
+            means, quats, scales, opacities, values, camera.viewmat, camera.K, camera.width, camera.height
+        )
+
+    module = SimpleNamespace(splats=range(3), device="cpu", composited=composited)
+    first, *others = shown(module, [View(replace(FRAME, camera=camera), thermal=torch.zeros(8, 8, 1))])
+    assert 0.9 * 64 < first <= 64 and max(others) < 0.05 * first
 
 
 def test_what_stands_under_a_mask_says_nothing_of_the_scene():

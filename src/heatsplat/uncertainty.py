@@ -133,6 +133,19 @@ def evidence(module: Any, views: Iterable[View]) -> Evidence:
     return Evidence(weight, misfit / weight.clamp(min=LEAST))
 
 
+@torch.no_grad()
+def shown(module: Any, views: Iterable[View]) -> Tensor:
+    """How much of some views each Gaussian of a training module shows, [N] float64 in pixels, 0 for those that none sees:
+    ``Evidence.weight`` alone, of one rendering and one backward pass for each view."""
+    sums = torch.zeros(len(module.splats), dtype=torch.float64)
+    for view in views:
+        camera = view.frame.camera
+        sums += _gathered(
+            module, view.to(module.device), torch.ones(camera.height, camera.width, 1, device=module.device)
+        )[:, 0]
+    return sums
+
+
 class Uncertainty:
     """Standard deviations of the temperature that a trained scene shows.
 

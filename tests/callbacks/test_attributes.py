@@ -156,33 +156,39 @@ def test_scenes_without_true_attributes_have_no_errors(tmp_path):
 
 
 def learned(folder, monkeypatch, scene=None, times=1.0, **options):
-    """What is written of a model of two Gaussians of one metre and a hundred of a millimetre."""
+    """What is written of a model of two Gaussians that training views show and a hundred that they hardly do."""
     scene = scene or wall()
-    scales = torch.cat([torch.ones(2, 3), torch.full((100, 3), 1e-3)])
-    splats = SimpleNamespace(scales=scales, opacities=torch.ones(1, 102))
+    weights = torch.cat([torch.full((2,), 500.0), torch.full((100,), 1e-3)]).double()
     told = {
         "emissivity": times * torch.cat([torch.tensor([0.4, 0.8]), torch.full((100,), 0.1)]),
         "absent": torch.full((102,), torch.nan),
     }
     off = {"emissivity": torch.cat([torch.tensor([0.05, 0.05]), torch.full((100,), 9.0)])}
+    seen = []
+    monkeypatch.setattr(attributes, "shown", lambda module, views: seen.extend(views.frames) or weights)
     monkeypatch.setattr(attributes, "Uncertainty", lambda module: SimpleNamespace(of_attributes=lambda frame: off))
     taken = {frame.frame_id for frame in scene.frames}
     module = SimpleNamespace(
         scene=scene,
-        splats=splats,
         # Of a view that no one took: a model that counts images by their numbers would tell of the first one alone.
         attributes=lambda frame: {} if frame.frame_id in taken else told,
         output_dir=folder,
     )
     LearnedValues(**options).on_test_epoch_end(None, module)
+    assert len(seen) == min(len(scene.train), options.get("views", 32))
     return read_csv(folder / LEARNED_FILE)
 
 
-def test_what_was_learned_counts_gaussians_by_their_area(tmp_path, monkeypatch):
-    (row,) = learned(tmp_path, monkeypatch)
+def test_what_was_learned_counts_gaussians_by_what_views_show_of_them(tmp_path, monkeypatch):
+    (row,) = learned(tmp_path, monkeypatch, views=3)
     assert (row["name"], row["low"], row["high"], row["deviation"]) == ("emissivity", 0.4, 0.8, None)
     text = "\n".join(learned_section(tmp_path))
     assert "0.4 to 0.8" in text and "±" not in text and "callbacks=uncertainty" in text
+
+
+def test_no_view_to_tell_what_is_shown_is_refused():
+    with pytest.raises(ValueError, match="callbacks.learned.views must be 1 or more, got 0"):
+        LearnedValues(views=0)
 
 
 def test_how_far_the_value_of_one_gaussian_is_off_stands_beside_where_it_is_asked_for(tmp_path, monkeypatch):

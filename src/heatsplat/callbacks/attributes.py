@@ -17,7 +17,7 @@ from heatsplat.io.quantities import impossible, words_and_unit
 from heatsplat.io.tables import write_csv
 from heatsplat.metrics.attribute_errors import attribute_errors
 from heatsplat.shots import at_time, first_free_id
-from heatsplat.uncertainty import Uncertainty
+from heatsplat.uncertainty import Uncertainty, shown
 
 LEARNED_FILE = "learned.csv"
 COLORMAP = "viridis"  # not that of temperatures
@@ -83,16 +83,20 @@ class AttributeErrors(pl.Callback):
 class LearnedValues(pl.Callback):
     """Writes learned.csv at the end of the test: of each attribute its unit, and what the median Gaussian and nine in ten have.
 
-    Gaussians count by their opacity and the area of their largest section, and at one moment, the middle of the record. Where a
-    part of them has what no surface can have, such as an absorptivity above 1, the column "remark" says how large it is.
+    Gaussians count by how much of the training views they show (``shown``), so that what stands behind a wall or far outside
+    does not, however large; and at one moment, the middle of the record. Where a part of them has what no surface can have, such
+    as an absorptivity above 1, the column "remark" says how large it is.
 
     Args:
+        views: training views, evenly spread, that tell how much Gaussians show; each is rendered once.
         deviations: whether how far the value of a single Gaussian is likely off stands beside, in the median
             (``Uncertainty.of_attributes``); renders every training view several times.
     """
 
-    def __init__(self, deviations: bool = False) -> None:
-        self.deviations = deviations
+    def __init__(self, views: int = 32, deviations: bool = False) -> None:
+        if views < 1:
+            raise ValueError(f"callbacks.learned.views must be 1 or more, got {views}")
+        self.views, self.deviations = views, deviations
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         scene = module.scene
@@ -103,12 +107,11 @@ class LearnedValues(pl.Callback):
         told = module.attributes(frame)
         if not told:
             return
-        sizes = module.splats.scales.detach().sort(dim=1).values[:, 1:].prod(1)
-        weights = (module.splats.opacities[0].detach() * sizes).double().cpu().numpy()
         off: dict[str, Tensor] = {}
-        if self.deviations:
-            # A test allows no gradient, of which deviations are made.
-            with torch.inference_mode(False), torch.no_grad():
+        # A test allows no gradient, of which weights and deviations are made.
+        with torch.inference_mode(False), torch.no_grad():
+            weights = shown(module, scene.train.subset(evenly_spread(len(scene.train), self.views))).numpy()
+            if self.deviations:
                 off = Uncertainty(module).of_attributes(frame)
         rows = []
         for name, of_each in told.items():
