@@ -11,6 +11,8 @@ class Nothing(SweepPlan):
         return []
 
 
-def test_a_plan_runs_and_composes_all_jobs_and_tells_nothing():
-    plan, jobs = Nothing(), [["seed=0"], ["seed=1"]]
-    assert not plan.idle and plan.summary() == "" and plan.to_compose(jobs) == jobs
+def test_a_plan_runs_and_tells_nothing_and_composes_all_jobs_that_differ_in_more_than_the_seed():
+    plan, steps = Nothing(), ("max_steps=1", "max_steps=2")
+    jobs = [[f"seed={seed}", text, "data.seed=3"] for seed in (0, 1) for text in steps]
+    assert not plan.idle and plan.summary() == "" and plan.to_compose(jobs) == jobs[:2]
+    assert plan.to_compose([["data.seed=0"], ["data.seed=1"]]) == [["data.seed=0"], ["data.seed=1"]]

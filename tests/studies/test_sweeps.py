@@ -291,6 +291,26 @@ def test_batches_after_one_with_a_failure_run_too_and_the_failure_is_told_at_the
         RowSweeper(max_batch_size=0)
 
 
+@pytest.mark.parametrize(("numbers", "told"), [(19, 0), (20, 1)])
+def test_settings_of_many_jobs_are_composed_once_for_all_seeds_and_that_is_told(monkeypatch, caplog, numbers, told):
+    compose_run("method=3dgs")
+    from hydra.plugins.sweeper import Sweeper
+
+    from heatsplat.studies.rows import Rows
+    from hydra_plugins.heatsplat_sweeper.rows import RowSweeper
+
+    composed = []
+    monkeypatch.setattr(Sweeper, "validate_batch_is_legal", lambda self, batch: composed.extend(batch))
+    sweeper = RowSweeper()
+    sweeper.plan = Rows({}, None, None, "3dgs")
+    with caplog.at_level("INFO", "heatsplat"):
+        sweeper.validate_batch_is_legal(
+            [[f"max_steps={k}", f"seed={seed}"] for seed in (0, 1, 2) for k in range(numbers)]
+        )
+    assert composed == [[f"max_steps={k}", "seed=0"] for k in range(numbers)]
+    assert caplog.text.count(f"composing the settings of {numbers} jobs before the first starts") == told
+
+
 @pytest.mark.parametrize(
     ("size", "expected"),
     [(None, ["seed=0 a", "b c d"]), (2, ["seed=0 a", "b c", "d"]), (1, ["seed=0", "a", "b", "c", "d"])],

@@ -5,13 +5,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 Overrides = Sequence[str]  # of a job
 FolderOf = Callable[[int, Overrides], Path]  # number and overrides of a job -> where its results will be
 
 
 class SweepPlan(ABC):
-    """What a sweep runs, and what it writes when the last job has ended."""
+    """What a sweep runs, and what it writes when the last job has ended.
+
+    Attributes:
+        alike: beginnings of overrides in which jobs may differ and still be composed alike.
+    """
+
+    alike: ClassVar[tuple[str, ...]] = ("seed=",)
 
     @property
     def idle(self) -> bool:
@@ -35,8 +42,10 @@ class SweepPlan(ABC):
         """
 
     def to_compose(self, jobs: Sequence[Overrides]) -> Sequence[Overrides]:
-        """Those of the jobs whose configurations show whether those of all can be composed."""
-        return jobs
+        """Those of the jobs whose configurations show whether those of all can be composed: one of those that are ``alike``."""
+        return list(
+            {tuple(text for text in job if not text.startswith(self.alike)): job for job in reversed(jobs)}.values()
+        )[::-1]
 
     @abstractmethod
     def write(self, folder: Path) -> list[Path]:

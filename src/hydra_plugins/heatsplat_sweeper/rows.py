@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("heatsplat")
 
+MANY = 20  # jobs that take long enough to compose to say so
+
 LONGEST = 120  # bytes; file systems allow 255, and row, scene and number come with them
 
 
@@ -144,9 +146,15 @@ class RowSweeper(BasicSweeper):
                 log.info("%s", path)
 
     def validate_batch_is_legal(self, batch: Sequence[Sequence[str]]) -> None:
-        """Composes every job before any starts, unless the launcher does so by itself: a hundred take a minute."""
-        if not isinstance(self.launcher, JobLauncher):
-            super().validate_batch_is_legal(self.plan.to_compose(batch))
+        """Composes the jobs before any starts, unless the launcher does so by itself: a hundred take a minute."""
+        if isinstance(self.launcher, JobLauncher):
+            return
+        jobs = self.plan.to_compose(batch)
+        if len(jobs) >= MANY:
+            log.info(
+                "composing the settings of %d jobs before the first starts, so that none fails by a name", len(jobs)
+            )
+        super().validate_batch_is_legal(jobs)
 
     def _plan_of(self, arguments: Sequence[str]) -> SweepPlan:
         """What the configuration asks for. Raises SceneError where there is no such thing, or nothing of it is on disk."""

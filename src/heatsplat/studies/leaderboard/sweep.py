@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.leaderboard.report import write_leaderboard
 from heatsplat.studies.sweep_plan import FolderOf, Overrides, SweepPlan
-
-# Overrides in which the jobs of a method and track differ, and which make no other configuration.
-ALIKE = ("data.scene=", "seed=", "callbacks.temperatures.image=")
 
 
 @dataclass(frozen=True)
@@ -23,6 +21,7 @@ class Leaderboard(SweepPlan):
     """
 
     board: Board
+    alike: ClassVar[tuple[str, ...]] = ("data.scene=", "seed=", "callbacks.temperatures.image=")
 
     @property
     def idle(self) -> bool:
@@ -34,10 +33,6 @@ class Leaderboard(SweepPlan):
     def jobs(self, grid: Sequence[Overrides], folder_of: FolderOf) -> tuple[list[Overrides], int]:
         """All of the board with one combination of the grid before the next."""
         return [job for given in grid for job in self.board.jobs(given)], 0
-
-    def to_compose(self, jobs: Sequence[Overrides]) -> Sequence[Overrides]:
-        """One job of each method and track."""
-        return list({tuple(text for text in job if not text.startswith(ALIKE)): job for job in jobs}.values())
 
     def write(self, folder: Path) -> list[Path]:
         """Table, CSV and page."""
