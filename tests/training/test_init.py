@@ -64,10 +64,18 @@ def test_points_on_a_line_start_as_balls(parts):
 
 
 @pytest.mark.parametrize(
-    ("recipe", "start"), [([], (0.1, 0.6)), (["recipe=published"], (1.0, 0.1)), (["init=random"], (1.0, 0.1))]
+    ("asked", "start"),
+    [
+        (["method=etgs"], (0.1, 0.6)),
+        (["method=etgs", "recipe=published"], (1.0, 0.1)),
+        (["method=etgs", "init=random"], (1.0, 0.1)),
+        (["method=energy_balance"], (0.1, 0.1)),
+        (["method=energy_balance", "start_opacity=0.3"], (0.1, 0.3)),
+        (["method=energy_balance", "init.opacity=0.5"], (0.1, 0.5)),
+    ],
 )
-def test_published_and_drawn_gaussians_start_as_faint_balls(recipe, start):
-    init = compose(["method=etgs", *recipe])["init"]
+def test_published_and_drawn_gaussians_start_as_faint_balls_and_those_of_a_balance_as_faint_discs(asked, start):
+    init = compose(asked)["init"]
     assert (init["thinnest"], init["opacity"]) == start
 
 
