@@ -308,7 +308,11 @@ CASES = {
         lambda: ByHand(air(sun=True, sky="auto", wind=True, shadows=True)),
         ("sky_seen",),
     ),
-    "albedo": Case(("relaxation", "solar"), lambda: ByHand(air(sun=True)), ()),
+    "albedo": Case(  # all that stands around, of which the march has a kernel anyway
+        ("relaxation", "solar", "radiation", "convection", "shadows"),
+        lambda: ByHand(air(sun=True, sky="auto", wind=True, shadows=True)),
+        (),
+    ),
     "conduction": Case(
         ("relaxation", "harmonic_source"),
         lambda: ByHand(NewtonHarmonic(frequencies=24)),
