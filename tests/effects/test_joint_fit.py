@@ -16,7 +16,7 @@ from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.held_out import HeldOut
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.selection import candidates, earns, pruned, selected
-from heatsplat.effects.physical import agc, fixed_pattern, frame_offset, view_dependence, vignetting
+from heatsplat.effects.physical import agc, fixed_pattern, frame_offset, tone, view_dependence, vignetting
 
 EFFECTS = {effect.name: effect for effect in CATALOGUE if effect.term is not None}
 OWN = {"relaxation", "harmonic_source", "view_dependence"}
@@ -257,6 +257,38 @@ def test_direction_beside_larger_mirrors_makes_up_for_their_normals(moving, monk
         sized(monkeypatch, reflection=2.0, view_dependence=size)
         monkeypatch.setattr(Fit, "gain", lambda fit, more, less: 5.0)
         assert (view_dependence.evidence(look(moving, "reflection", "view_dependence")).statistic > 2.5) == on
+
+
+def test_mirrors_in_the_place_of_harmonics_leave_them_nothing(moving):
+    verdict = view_dependence.evidence(look(moving, "reflection"))
+    assert verdict.statistic == 0.0 and verdict.told and "mirrors" in verdict.reason
+
+
+def test_a_pattern_without_which_nothing_is_lost_is_absent(moving, monkeypatch):
+    monkeypatch.setattr(vignetting, "falloff", lambda fit, none: (0.0, 0.0))
+    monkeypatch.setattr(Fit, "gain", lambda fit, more, less: 1.5)
+    sized(monkeypatch, fixed_pattern=1.0)
+    seen = look(moving)
+    seen.for_patterns.worth = lambda name, more=None, less=None: Worth(HeldOut(db=0.5, sigmas=9.0, images=FRAMES))
+    assert not fixed_pattern.evidence(seen).told  # a small gain may be an error of what else is fitted
+    seen.for_patterns.idle = lambda name, more, less: True
+    assert fixed_pattern.evidence(seen).told and fixed_pattern.evidence(seen).statistic == 0.0
+
+
+def test_a_curve_is_in_doubt_only_if_it_explains_what_it_was_not_fitted_to():
+    offsets = 0.1 * drawn(FRAMES, seed=7)
+    straight, bent = fit_to(levels() + offsets), fit_to(levels() + offsets * (1.0 + 3.0 * (levels() - 0.5)))
+    assert tone._may_bend(bent.accepted(Model.of(frame_offset=1)), Model())
+    assert not tone._may_bend(straight.accepted(Model.of(frame_offset=1)), Model())
+
+
+@pytest.mark.parametrize("db, sigmas, doubted", [(0.5, 3.0, True), (-0.5, -3.0, False), (0.05, 3.0, False)])
+def test_a_curve_that_gains_nothing_where_left_out_is_absent_with_offsets_or_without(monkeypatch, db, sigmas, doubted):
+    fit = fit_to(levels() + DRIFT)
+    monkeypatch.setattr(Fit, "gain", lambda fit, more, less: 1.5)
+    sized(monkeypatch, tone=1.0)
+    monkeypatch.setattr(tone.Certainty, "compared", lambda self, more, less: HeldOut(db, sigmas, FRAMES))
+    assert tone._may_bend(fit, Model()) == doubted
 
 
 def test_gains_beside_a_bent_curve_make_up_for_it_and_else_take_the_offsets_along(moving, monkeypatch):

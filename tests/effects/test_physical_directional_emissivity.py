@@ -15,7 +15,8 @@ from heatsplat.effects.joint.fit import fit_of
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.selection import given_way, selected, worthwhile
 from heatsplat.effects.physical import directional_emissivity
-from heatsplat.effects.physical.directional_emissivity import falloff_of, slant
+from heatsplat.effects.physical.directional_emissivity import falloff_of, on_surfaces, slant
+from heatsplat.geometry.rotations import reflected
 
 NORMALS = functional.normalize(drawn(POINTS, 3, seed=21), dim=1)
 AMBIENT = 0.2
@@ -73,6 +74,25 @@ def test_harmonics_that_make_up_for_normals_of_some_points_are_not_taken_in():
     beside = angle.plus("view_dependence", 1)
     assert fit.effect_size(beside, angle) > 0.5  # though they are large
     assert not worthwhile(fit, beside, angle, "view_dependence")
+
+
+def test_mirrors_take_the_place_of_harmonics_that_make_up_for_normals_of_some_points():
+    x, y, z = reflected(-data_of(levels()).tracks.directions, NORMALS[:, None]).unbind(2)
+    rough = NORMALS.clone()
+    rough[::5] = rough[::5].roll(1, 1)
+    truth = data_of(levels() + 0.2 * x - 0.1 * y * z, normals=rough)
+    harmonics = Model.of(view_dependence=1)
+    assert given_way(fit_of(truth), harmonics) == Model.of(reflection=1)
+
+
+def test_what_few_slanted_points_lose_is_no_falloff_of_all():
+    angle = Model.of(directional_emissivity=1)
+    for dull, told in ((torch.ones(POINTS, 1), True), (torch.arange(POINTS)[:, None] % 10 == 0, False)):
+        empty = data_of(levels(), noise=0.0, normals=NORMALS)
+        share = 1.0 - 0.4 * dull * slant(empty, 1)
+        seen = data_of(AMBIENT + share * (levels() - AMBIENT), noise=0.001, normals=NORMALS)
+        fit = fit_of(Data(seen.effects, seen.tracks, seen.times_s, AMBIENT, NOISE, NORMALS)).accepted(angle)
+        assert on_surfaces(fit, angle, Model()) == told
 
 
 def test_what_shared_effects_add_is_no_excess():

@@ -127,6 +127,23 @@ def test_a_body_with_a_core_has_two_nodes():
     assert recorded(depth=3.0).nodes == 2
 
 
+@pytest.mark.parametrize(
+    "name, gain, share, told",
+    [
+        ("solar", HeldOut(0.0, -0.1, 9), 0.11, False),  # bodies take light that few frames do not show where left out
+        ("solar", HeldOut(0.0, -0.1, 9), 0.02, True),
+        ("radiation", HeldOut(-0.03, -0.5, 9), 0.15, False),
+        ("radiation", HeldOut(-0.03, -0.5, 9), 0.02, True),
+        ("convection", HeldOut(0.04, 3.4, 16), 0.0, False),  # small, but no chance
+        ("convection", HeldOut(0.04, 1.0, 16), 0.0, True),
+    ],
+)
+def test_a_part_is_absent_if_it_gains_nothing_and_nothing_says_that_it_may_be_there(name, gain, share, told):
+    seen = SimpleNamespace(gain=lambda name: gain, shares={"solar": share, "radiation": share}, dark=True)
+    evidence = judged(seen, name, "")
+    assert evidence.told == told and evidence.statistic < 4, evidence
+
+
 def test_without_a_record_nothing_is_told():
     evidence = judged(None, "solar", "there is no record")
     assert not evidence.told and evidence.reason == "there is no record"

@@ -28,9 +28,7 @@ ELSEWHERE = {
     "datamodules/test_thermo": "datamodules/surroundings",
     "datamodules/test_weather": "datamodules/sun",
     "density/test_adaptive": "density/base density/fixed",
-    "effects/test_catalogue": (
-        "effects/base effects/surface effects/weather_record effects/physical/reflection effects/physical/relaxation"
-    ),
+    "effects/test_catalogue": "effects/base effects/weather_record effects/physical/reflection effects/physical/relaxation",
     "effects/test_joint_fit": (
         "effects/joint/data effects/joint/evidence effects/joint/image_grid effects/joint/least_squares effects/joint/model "
         "effects/joint/selection effects/joint/terms effects/physical/fixed_pattern "
@@ -72,7 +70,7 @@ ELSEWHERE = {
     "training/test_runs": "training/checkpoints training/module training/rng training/session",
     "benchmarks/test_renderer": "kernels/peak",
 }
-LONGEST = 121  # modules; lower it when some go
+LONGEST = 120  # modules; lower it when some go
 
 
 def modules() -> list[str]:

@@ -77,13 +77,16 @@ def judged(weathered: Weathered | None, name: str, why: str) -> Evidence:
         return Evidence(None, why, told=False)
     gain = weathered.gain(name)
     found = f"balances of heat gain {gain.db:.2f} dB by it where left out, {gain.sigmas:.1f} standard errors"
-    large = True
+    large, none = True, True
     if name in LEAST:
         share = weathered.shares[name]
-        found, large = f"{found}; bodies take a share of {share:.2f}", share > LEAST[name]
+        large = share > LEAST[name]
+        # Few frames gain nothing by it, but what bodies take says that it may be there. Where it is not, that is 0.02 at most.
+        found, none = f"{found}; bodies take a share of {share:.2f}", not large
+    nothing_db = NOTHING_DB if gain.sigmas <= PART_SIGMAS else 0.0  # what is no chance is there, however small
     if name == "radiation" and not weathered.dark:
         return weighed(gain, found, large, False, "more of them in the dark", sigmas=PART_SIGMAS)
-    return weighed(gain, found, large, sigmas=PART_SIGMAS)
+    return weighed(gain, found, large, none, nothing_db=nothing_db, sigmas=PART_SIGMAS)
 
 
 def around(inspected: Inspection, name: str) -> Evidence:

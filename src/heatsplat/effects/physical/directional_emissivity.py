@@ -16,11 +16,19 @@ from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained, selected_kind
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.least_squares import own_part
+from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Path
 
 POWERS = (1, 5)  # of 1 - cos θ: of rough surfaces, and of smooth dielectrics (Schlick)
 STEPS, CLOSE = 5, 1e-3  # of Gauss and Newton, and how small the last one is
 LARGEST = 0.95  # share of its excess that a surface loses along itself, at most
+CHANGED = 0.5  # share of the points, those that a falloff changes most, that have to show it
+# Share of what harmonics explain at the usual one of them that a falloff has to explain: it does 0.9 to 1.1 of rough surfaces,
+# 0.5 to 0.8 of smooth ones, of whose normals more depends, and up to 0.1 before a camera that blurs.
+SHOWN = 0.33
+AT_FEW = (
+    "few of the points that it would change show it, as where blur takes contrast at edges; sharper images would tell"
+)
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -67,6 +75,21 @@ def falloff_of(fit: Fit, power: int, excess: Tensor, basis: Tensor, weights: Ten
     return falloff
 
 
+def on_surfaces(fit: Fit, more: Model, less: Model) -> bool:
+    """Whether points that a falloff changes most show it, which explains at the usual one of them what harmonics of its own do.
+
+    Blur takes contrast at slanted edges, as a falloff would there; but of other slanted points it takes none.
+    """
+    excess, basis, weights = fit.before_path(more, "directional_emissivity")
+    taken = slant(fit.data, more.kind("directional_emissivity")) * own_part(basis, excess, weights)
+    taken = (weights * (taken - own_part(basis, taken, weights)) ** 2).sum(1) / (weights > 0).sum(1).clamp_min(1)
+    own = less.plus("view_dependence")
+    explained, possible = (fit.variances(less) - fit.variances(one) for one in (more, own))
+    used = (weights > 0).any(1)
+    asked = used & (taken >= taken[used].quantile(1.0 - CHANGED)) & (possible > 0)
+    return bool(asked.any()) and float((explained / possible)[asked].median()) > SHOWN
+
+
 def slant(data: Data, power: int) -> Tensor:
     """(1 - cos θ) to a power, θ being the angle between line of sight and normal, [P, F]."""
     facing = (data.tracks.directions * data.normals[:, None]).sum(2).abs().clamp(max=1.0)
@@ -85,7 +108,7 @@ EFFECT = Effect(
     summary="surfaces emit less towards their sides",
     source="emissivity of dielectrics, Schlick (1994); Kirchhoff's law",
     null="a point looks the same from above and from the side",
-    # Up to 43 without it: blur and uneven pixels look a little like it, and gain too little where left out, but for one of five.
+    # Up to 43 without it: blur and uneven pixels look a little like it, and gain too little where left out, or at few points.
     # From 1075 with it.
     threshold=SHARED_HURDLE,
     adds="one number for all surfaces, a normal and a tilt for each Gaussian",
@@ -96,6 +119,7 @@ EFFECT = Effect(
         kinds=kinds,
         numbers=lambda data, kind: 1,
         unseen=lambda data: "the points show no surface",
+        told_by=((on_surfaces, AT_FEW),),
         smallest=0.1,
     ),
 )

@@ -45,7 +45,7 @@ def evidence(inspected: Inspection) -> Evidence:
     if worthwhile(fit, more, less, "fixed_pattern") and fit.gain(more, less) > 1.0:
         evidence = judged(certainty, "fixed_pattern", found, more, less)
         much = fit.data.drivers is None and evidence.gain_db is not None and evidence.gain_db > FIFTH_DB
-        if evidence.told and evidence.statistic < SURE and not much:
+        if evidence.told and 0 < evidence.statistic < SURE and not much:
             return replace(evidence, told=False, reason=f"{evidence.reason}: cannot be told, more frames would tell")
         return evidence
     return Evidence(0.0, f"{found} {beside(fit.effect_size(more, less))}")

@@ -9,11 +9,13 @@ from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.certainty import Certainty, shows
 from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.model import Model
+from heatsplat.effects.joint.selection import worthwhile
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared
 from heatsplat.effects.physical import frame_offset
 
@@ -35,10 +37,15 @@ def evidence(inspected: Inspection) -> Evidence:
 
 
 def _may_bend(fit: Fit, model: Model) -> bool:
-    """Whether a curve explains anything if offsets move the levels along it."""
+    """Whether a curve explains anything, of what it was not fitted to as well, if offsets move the levels along it.
+
+    If it does not it is absent: nothing shows a curve without offsets, and nothing is lost without it.
+    """
     drifting = model.plus("frame_offset")
-    at = fit.linearised(drifting)
-    return at.gain(drifting.plus("tone"), drifting) > 1.0
+    at, bent = fit.linearised(drifting), drifting.plus("tone")
+    if at.gain(bent, drifting) <= 1.0 or not worthwhile(at, bent, drifting, "tone"):
+        return False
+    return shows(Certainty(at, drifting).compared(bent, drifting))
 
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Columns:

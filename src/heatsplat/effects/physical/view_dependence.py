@@ -18,6 +18,8 @@ def evidence(inspected: Inspection) -> Evidence:
     taken = () if inspected.joint is None else inspected.joint[1].names
     if "directional_emissivity" in taken and "view_dependence" not in taken:
         return Evidence(0.0, "what depends on direction is emissivity, as far as normals are known")
+    if "reflection" in taken and "view_dependence" not in taken:
+        return Evidence(0.0, "what depends on direction is mirrors, as far as their normals are known")
     return gained(inspected, "view_dependence", "points change with the direction of view by")
 
 
@@ -37,6 +39,6 @@ EFFECT = Effect(
         basis=lambda fit, kind: fit.data.tracks.directions,
         kinds=where_moving,
         frames=lambda data: well_seen(4),
-        gives_way_to=("directional_emissivity",),
+        gives_way_to=("directional_emissivity", "reflection"),
     ),
 )
