@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
-from heatsplat.effects.heat_source import PATTERNS
+from heatsplat.effects.heat_source import KNOWN, NAME, PATTERNS
 from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
@@ -45,7 +45,10 @@ def evidence(inspected: Inspection) -> Evidence:
     if worthwhile(fit, more, less, "fixed_pattern") and fit.gain(more, less) > 1.0:
         evidence = judged(certainty, "fixed_pattern", found, more, less)
         much = fit.data.drivers is None and evidence.gain_db is not None and evidence.gain_db > FIFTH_DB
-        if evidence.told and 0 < evidence.statistic < SURE and not much:
+        # Without it nothing is lost either where the courses of a driven scene take it, which are any.
+        courses = less.kind(NAME) not in (None, KNOWN)
+        lost = evidence.statistic > 0 or courses
+        if evidence.told and lost and evidence.statistic < SURE and not much:
             return replace(evidence, told=False, reason=f"{evidence.reason}: cannot be told, more frames would tell")
         return evidence
     return Evidence(0.0, f"{found} {beside(fit.effect_size(more, less))}")
