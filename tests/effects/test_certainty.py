@@ -92,6 +92,17 @@ def test_offsets_that_few_frames_cannot_tell_from_heat_leave_it_open():
     assert "are needed" in certainty.few("relaxation") and "are needed" in certainty.few("harmonic_source")
 
 
+def test_points_may_warm_where_heat_was_taken_in_or_nobody_can_tell():
+    assert Certainty(fit_to(COOLING), Model.of(relaxation=1)).may_warm
+    assert not Certainty(fit_to(levels()), NOTHING).may_warm
+    assert not Certainty(fit_to(DRIFTING), Model.of(frame_offset=1)).may_warm
+    alike = Certainty(fit_to(levels() + 0.1 * torch.exp(-3 * PASSED)), Model.of(frame_offset=1))
+    assert alike.may_warm  # in doubt
+    data = data_of(COOLING + 0.05 * drawn(POINTS, 1, seed=10) * torch.sin(9 * PASSED))
+    data.tracks.weights[:, [f for f in range(FRAMES) if f not in (0, 4, 9, 13, 18, 22, 27)]] = 0
+    assert Certainty(fit_of(data), NOTHING).may_warm  # too few frames
+
+
 def test_what_is_left_out_is_undecided_only_if_it_may_gain_where_it_was_not_fitted(monkeypatch):
     certainty = Certainty(fit_to(DRIFTING), NOTHING)
     monkeypatch.setattr(Fit, "gain", lambda fit, more, less: 1.5)

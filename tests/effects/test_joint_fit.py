@@ -9,7 +9,7 @@ from effects.tracks import FRAMES, PASSED, POINTS, drawn, fit_to, levels, positi
 
 from heatsplat.effects.catalogue import CATALOGUE
 from heatsplat.effects.joint import least_squares, selection
-from heatsplat.effects.joint.certainty import Worth
+from heatsplat.effects.joint.certainty import Certainty, Worth
 from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
@@ -235,6 +235,7 @@ SURE = SimpleNamespace(
     doubts={}, told={}, explained=True, unseen_changes="", few=lambda name: "", undecided=lambda more, name: False,
     worth=lambda name, more=None, less=None: Worth(HeldOut(db=3.0, sigmas=9.0, images=FRAMES)),
     idle=lambda name, more, less: False, clear=lambda more, name: False, beside_weather=lambda model: model,
+    compared=lambda more, less: HeldOut(db=3.0, sigmas=9.0, images=FRAMES),
 )  # fmt: skip
 
 
@@ -269,17 +270,40 @@ def test_a_pattern_without_which_nothing_is_lost_is_absent(moving, monkeypatch):
     monkeypatch.setattr(Fit, "gain", lambda fit, more, less: 1.5)
     sized(monkeypatch, fixed_pattern=1.0)
     seen = look(moving)
-    seen.for_patterns.worth = lambda name, more=None, less=None: Worth(HeldOut(db=0.5, sigmas=9.0, images=FRAMES))
+    seen.for_patterns.compared = lambda more, less: HeldOut(db=0.5, sigmas=9.0, images=FRAMES)
     assert not fixed_pattern.evidence(seen).told  # a small gain may be an error of what else is fitted
     seen.for_patterns.idle = lambda name, more, less: True
     assert fixed_pattern.evidence(seen).told and fixed_pattern.evidence(seen).statistic == 0.0
 
 
+@pytest.mark.parametrize("beside, told", [("view_dependence", False), ("frame_offset", True)])
+def test_a_pattern_is_certain_only_if_it_gains_much_without_what_may_not_be_there(moving, monkeypatch, beside, told):
+    """But what images change by something has to explain, if it be another thing."""
+    monkeypatch.setattr(vignetting, "falloff", lambda fit, none: (0.0, 0.0))
+    monkeypatch.setattr(Fit, "gain", lambda fit, more, less: 3.0)
+    sized(monkeypatch, fixed_pattern=1.0)
+    seen = look(moving, beside)
+    found = seen.for_patterns
+    found.compared = lambda more, less: HeldOut(db=1.1 if less.names else 0.9, sigmas=9.0, images=FRAMES)
+    assert fixed_pattern.evidence(seen).told
+    found.doubts = {beside: "nobody can tell"}
+    assert fixed_pattern.evidence(seen).told == told
+
+
 def test_a_curve_is_in_doubt_only_if_it_explains_what_it_was_not_fitted_to():
     offsets = 0.1 * drawn(FRAMES, seed=7)
     straight, bent = fit_to(levels() + offsets), fit_to(levels() + offsets * (1.0 + 3.0 * (levels() - 0.5)))
-    assert tone._may_bend(bent.accepted(Model.of(frame_offset=1)), Model())
-    assert not tone._may_bend(straight.accepted(Model.of(frame_offset=1)), Model())
+    assert tone._may_bend(Certainty(bent.accepted(Model.of(frame_offset=1)), Model()))
+    assert not tone._may_bend(Certainty(straight.accepted(Model.of(frame_offset=1)), Model()))
+
+
+@pytest.mark.parametrize("stretch, bend, bent", [(0.0, 10.0, True), (0.0, 0.0, False), (3.0, 0.0, False)])
+def test_where_heat_is_in_doubt_a_curve_is_asked_for_beside_a_camera_in_its_place(stretch, bend, bent):
+    """Heat takes the offsets along, and what a curve makes of them; gains of the images are no curve."""
+    offsets, over = 0.3 * torch.exp(-3.0 * PASSED), levels() - 0.5
+    fit = fit_to(levels() + offsets * (1.0 + stretch * over + bend * over**2)).accepted(CHANGING)
+    assert not tone._may_bend(Certainty(fit, CHANGING))
+    assert tone._may_bend(Certainty(fit, CHANGING, {"relaxation": "a camera explains it as well"})) == bent
 
 
 @pytest.mark.parametrize("db, sigmas, doubted", [(0.5, 3.0, True), (-0.5, -3.0, False), (0.05, 3.0, False)])
@@ -288,7 +312,7 @@ def test_a_curve_that_gains_nothing_where_left_out_is_absent_with_offsets_or_wit
     monkeypatch.setattr(Fit, "gain", lambda fit, more, less: 1.5)
     sized(monkeypatch, tone=1.0)
     monkeypatch.setattr(tone.Certainty, "compared", lambda self, more, less: HeldOut(db, sigmas, FRAMES))
-    assert tone._may_bend(fit, Model()) == doubted
+    assert tone._may_bend(SimpleNamespace(fit=fit, model=Model(), doubts={})) == doubted
 
 
 def test_gains_beside_a_bent_curve_make_up_for_it_and_else_take_the_offsets_along(moving, monkeypatch):

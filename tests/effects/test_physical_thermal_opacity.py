@@ -18,3 +18,13 @@ def test_few_votes_tell_where_so_few_of_them_differ(monkeypatch, points, apart, 
     seen = SimpleNamespace(scene=None, joint=None, obs=SimpleNamespace(tracks=(), still=False, why=""))
     evidence = thermal_opacity.evidence(seen)
     assert evidence.told is told and evidence.statistic == 0.0
+
+
+@pytest.mark.parametrize(("warms", "told"), [(False, True), (True, False)])
+def test_thermal_images_that_vary_say_nothing_where_points_may_be_lit_or_cool(monkeypatch, warms, told):
+    """Two of eight differ; of those whose thermal image shows the nearer point one of three, and that may be many."""
+    votes = torch.tensor([1, -1, -1, 1, 1, -1, -1, -1]), torch.tensor([1, 1, -1, 1, -1, -1, -1, -1])
+    monkeypatch.setattr(thermal_opacity, "_votes", lambda scene: votes)
+    obs = SimpleNamespace(tracks=(), still=False, why="")
+    seen = SimpleNamespace(scene=None, joint=(), obs=obs, certainty=SimpleNamespace(may_warm=warms))
+    assert thermal_opacity.evidence(seen).told is told

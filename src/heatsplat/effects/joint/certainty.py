@@ -157,6 +157,12 @@ class Certainty:
         changing = self._changing(self.model)
         return not changing or any(self._shows(one, self.model) for one in changing)
 
+    @cached_property
+    def may_warm(self) -> bool:
+        """Whether points are lit or cool, or nobody can tell whether they do."""
+        heat = [name for name, one in self.fit.data.effects.items() if one.term.in_time and name != ANY]
+        return any(name in self.model.names or name in self.doubts or self.few(name) for name in heat)
+
     def few(self, name: str) -> str:
         """That the record has too few frames to tell an effect that was left out, and how many are needed; empty where it has
         enough, and where nothing is left that it could explain."""

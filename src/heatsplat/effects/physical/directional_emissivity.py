@@ -26,9 +26,7 @@ CHANGED = 0.5  # share of the points, those that a falloff changes most, that ha
 # Share of what harmonics explain at the usual one of them that a falloff has to explain: it does 0.9 to 1.1 of rough surfaces,
 # 0.5 to 0.8 of smooth ones, of whose normals more depends, and up to 0.1 before a camera that blurs.
 SHOWN = 0.33
-AT_FEW = (
-    "few of the points that it would change show it, as where blur takes contrast at edges; sharper images would tell"
-)
+MORE = "what points change with direction is mostly something else, as where blur takes contrast; sharper images would tell"
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -76,9 +74,9 @@ def falloff_of(fit: Fit, power: int, excess: Tensor, basis: Tensor, weights: Ten
 
 
 def on_surfaces(fit: Fit, more: Model, less: Model) -> bool:
-    """Whether points that a falloff changes most show it, which explains at the usual one of them what harmonics of its own do.
+    """Whether a falloff explains, at the usual of the points that it changes most, a good part of what harmonics of its own do.
 
-    Blur takes contrast at slanted edges, as a falloff would there; but of other slanted points it takes none.
+    Blur takes contrast of slanted points, as a falloff would; but also from afar and beside edges, which a falloff leaves.
     """
     excess, basis, weights = fit.before_path(more, "directional_emissivity")
     taken = slant(fit.data, more.kind("directional_emissivity")) * own_part(basis, excess, weights)
@@ -108,7 +106,7 @@ EFFECT = Effect(
     summary="surfaces emit less towards their sides",
     source="emissivity of dielectrics, Schlick (1994); Kirchhoff's law",
     null="a point looks the same from above and from the side",
-    # Up to 43 without it: blur and uneven pixels look a little like it, and gain too little where left out, or at few points.
+    # Up to 43 without it: blur and uneven pixels look a little like it, and gain too little where left out, or beside harmonics.
     # From 1075 with it.
     threshold=SHARED_HURDLE,
     adds="one number for all surfaces, a normal and a tilt for each Gaussian",
@@ -119,7 +117,7 @@ EFFECT = Effect(
         kinds=kinds,
         numbers=lambda data, kind: 1,
         unseen=lambda data: "the points show no surface",
-        told_by=((on_surfaces, AT_FEW),),
+        told_by=((on_surfaces, MORE),),
         smallest=0.1,
     ),
 )

@@ -11,6 +11,7 @@ from torch import Tensor
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.heat_source import KNOWN, NAME, PATTERNS
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.certainty import Certainty
 from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import beside, judged
@@ -44,14 +45,26 @@ def evidence(inspected: Inspection) -> Evidence:
     found = "places in the image differ" + (" beside the falloff" if fades else "") + " by"
     if worthwhile(fit, more, less, "fixed_pattern") and fit.gain(more, less) > 1.0:
         evidence = judged(certainty, "fixed_pattern", found, more, less)
-        much = fit.data.drivers is None and evidence.gain_db is not None and evidence.gain_db > FIFTH_DB
         # Without it nothing is lost either where the courses of a driven scene take it, which are any.
         courses = less.kind(NAME) not in (None, KNOWN)
         lost = evidence.statistic > 0 or courses
-        if evidence.told and lost and evidence.statistic < SURE and not much:
+        if evidence.told and lost and evidence.statistic < SURE and not _much(certainty, more, less):
             return replace(evidence, told=False, reason=f"{evidence.reason}: cannot be told, more frames would tell")
         return evidence
     return Evidence(0.0, f"{found} {beside(fit.effect_size(more, less))}")
+
+
+def _much(certainty: Certainty, more: Model, less: Model) -> bool:
+    """Whether a pattern gains a fifth of all that the others leave; also if those of them are left out that may not be there.
+
+    What changes over time or from image to image stays: it may be something else, but something changes the images.
+    """
+    fit = certainty.fit
+    if fit.data.drivers is not None:
+        return False
+    terms = {name: fit.data.effects[name].term for name in less.names & certainty.doubts.keys()}
+    doubted = [name for name, term in terms.items() if not (term.in_time or term.single_images)]
+    return all(certainty.compared(more.minus(rest), less.minus(rest)).db > FIFTH_DB for rest in ((), doubted))
 
 
 def nodes(data: Data) -> int:

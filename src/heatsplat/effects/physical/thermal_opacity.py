@@ -10,7 +10,6 @@ from torch import Tensor
 from heatsplat.contracts import SceneData, evenly_spread
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.joint.evidence import selected_kind
 from heatsplat.effects.observations import MAX_FRAMES, MIN_FRAMES, NEARER, between
 from heatsplat.geometry.projection import to_camera, to_pixels
 
@@ -35,7 +34,7 @@ def evidence(inspected: Inspection) -> Evidence:
     if votes is None:
         return Evidence(None, "not every training view has a visible image of the thermal image's size")
     thermal, visible = votes
-    if selected_kind(inspected, "relaxation"):
+    if inspected.joint is not None and inspected.certainty.may_warm:
         # What is lit or cools changes by itself, so that a thermal image that varies says nothing of what it shows.
         thermal = thermal.clamp_min(0)
     sure = (thermal != 0) & (visible != 0)

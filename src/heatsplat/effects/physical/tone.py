@@ -30,19 +30,25 @@ def evidence(inspected: Inspection) -> Evidence:
     on = found.statistic is not None and found.statistic > EFFECT.threshold
     if on or not found.told or inspected.joint is None or frame_offset.evidence(inspected).told:
         return found
-    if _may_bend(*inspected.joint):
+    if _may_bend(inspected.certainty):
         why = "nobody can tell whether offsets move the levels along a curve"
         return Evidence(None, f"cannot be told: {why}", told=False)
     return found
 
 
-def _may_bend(fit: Fit, model: Model) -> bool:
+def _may_bend(certainty: Certainty) -> bool:
     """Whether a curve explains anything, of what it was not fitted to as well, if offsets move the levels along it.
 
-    If it does not it is absent: nothing shows a curve without offsets, and nothing is lost without it.
+    If it does not it is absent: nothing shows a curve without offsets, and nothing is lost without it. Heat that nobody can tell
+    takes the offsets along, and the curve with them. It is therefore asked beside what would explain the images as well as that
+    heat does: a camera with an offset and a gain of its own in each image.
     """
-    drifting = model.plus("frame_offset")
-    at, bent = fit.linearised(drifting), drifting.plus("tone")
+    fit, model = certainty.fit, certainty.model
+    heat = [name for name in model.names if fit.data.effects[name].term.in_time and name in certainty.doubts]
+    drifting = model.minus(heat).plus("frame_offset")
+    drifting = drifting.plus("agc") if heat else drifting
+    at = fit.accepted(drifting).accepted(drifting) if heat else fit.linearised(drifting)
+    bent = drifting.plus("tone")
     if at.gain(bent, drifting) <= 1.0 or not worthwhile(at, bent, drifting, "tone"):
         return False
     return shows(Certainty(at, drifting).compared(bent, drifting))
