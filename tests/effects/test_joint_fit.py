@@ -11,6 +11,7 @@ from heatsplat.effects.catalogue import CATALOGUE
 from heatsplat.effects.joint import least_squares, selection
 from heatsplat.effects.joint.certainty import Certainty, Worth
 from heatsplat.effects.joint.columns import Columns
+from heatsplat.effects.joint.courses import ANY
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.held_out import HeldOut
@@ -337,6 +338,26 @@ def test_a_falloff_darkens_corners_and_takes_the_radial_part_of_the_pattern(movi
     assert fixed_pattern.evidence(look(moving)).statistic == 5.0
     radial = {"vignetting"} if fades else set()
     assert set(asked) == {(frozenset(radial | {"fixed_pattern"}), frozenset(radial))}
+
+
+@pytest.mark.parametrize(
+    "share, gain, size, told",
+    [
+        (0.05, 0.2, 0.05, True),
+        (0.05, 0.2, 0.2, False),  # something goes with the distance from the middle, and is no falloff
+        (-0.2, 5.0, 0.2, True),  # it is one
+        (-0.2, 0.2, 0.2, False),
+        (0.4, 0.2, 0.05, False),  # unlikely large
+        (-0.4, 0.2, 0.05, False),
+    ],
+)
+def test_under_the_sky_what_is_no_clear_falloff_may_hide_one(monkeypatch, share, gain, size, told):
+    monkeypatch.setattr(vignetting, "falloff", lambda fit, none: (share, gain))
+    sized(monkeypatch, vignetting=size, **{ANY: 1.0})
+    monkeypatch.setattr(Certainty, "worth", lambda *_: Worth(HeldOut(db=3.0, sigmas=9.0, images=FRAMES)))
+    fit = fit_to(levels(), drivers=torch.sin(5 * PASSED)[:, None])
+    verdict = vignetting.evidence(SimpleNamespace(joint=(fit, Model()), for_patterns=Certainty(fit, Model())))
+    assert verdict.told == told and (told and verdict.statistic > 1.3) == (told and share < 0)
 
 
 def test_a_falloff_is_measured():

@@ -43,8 +43,9 @@ def evidence(inspected: Inspection) -> Evidence:
     why = (
         f"distance from the middle of the image changes values by {beside(size)} ({100 * share:+.0f} % in the corners)"
     )
-    if fit.data.drivers is not None and (share > WILD or share < -WILD and gain < UNSURE[0]):
-        return Evidence(gain, f"{why}: cannot be told, heat may pass for it; more frames would tell", told=False)
+    if fit.data.drivers is not None and _heat_may_be_it(fit, radial, none, share, gain):
+        why = f"{why}: cannot be told, heat may pass for it or hide it; more frames would tell"
+        return Evidence(gain, why, told=False)
     if share >= MIN_FALLOFF:
         return Evidence(0.0, f"{why}, which is no falloff")
     if not worthwhile(fit, radial, none, "vignetting"):
@@ -55,6 +56,16 @@ def evidence(inspected: Inspection) -> Evidence:
         doubt = "a pattern of the camera may have as much of a falloff; more frames would tell"
     told = gain <= UNSURE[0] or not doubt
     return Evidence(gain, why if told else f"{why}: cannot be told, {doubt}", told=told, gain_db=worth.held_out.db)
+
+
+def _heat_may_be_it(fit: Fit, radial: Model, none: Model, share: float, gain: float) -> bool:
+    """Whether what a weather record misses of heat passes for a falloff of that ``share`` and ``gain``, or hides one.
+
+    It does where the falloff is unlikely large, and where something goes with the distance from the middle that is no clear one.
+    """
+    wild = share > WILD or share < -WILD and gain < UNSURE[0]
+    fades = share < MIN_FALLOFF and gain > UNSURE[0] and worthwhile(fit, radial, none, "vignetting")
+    return wild or not fades and fit.effect_size(radial, none) >= EFFECT.term.smallest
 
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Columns:
