@@ -183,7 +183,8 @@ def test_what_was_learned_counts_gaussians_by_what_views_show_of_them(tmp_path, 
     (row,) = learned(tmp_path, monkeypatch, views=3)
     assert (row["name"], row["low"], row["high"], row["deviation"]) == ("emissivity", 0.4, 0.8, None)
     text = "\n".join(learned_section(tmp_path))
-    assert "0.4 to 0.8" in text and "±" not in text and "callbacks=uncertainty" in text
+    assert "0.4 to 0.8" in text and "90 % of what training views show" in text
+    assert "±" not in text and "callbacks=uncertainty" in text
 
 
 def test_no_view_to_tell_what_is_shown_is_refused():

@@ -150,7 +150,7 @@ def learned_section(folder: Path) -> list[str]:
         told += [f"± {_number(row['deviation'])}" if row["deviation"] else NONE] * known
         rows.append((*told, row["unit"] or "", *[row.get("remark") or ""] * remarked))
     note = (
-        "The interval contains 90 % of the Gaussians, weighted by opacity and area. It shows how the scene varies, not the "
+        "The interval contains 90 % of what training views show of the Gaussians. It tells how the scene varies, not the "
         "uncertainty of a "
         + ("value, which is the median standard deviation of one Gaussian. " if known else
            "value, which `evaluate.py callbacks=uncertainty` estimates. ")
