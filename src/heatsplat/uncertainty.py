@@ -140,9 +140,8 @@ def shown(module: Any, views: Iterable[View]) -> Tensor:
     sums = torch.zeros(len(module.splats), dtype=torch.float64)
     for view in views:
         camera = view.frame.camera
-        sums += _gathered(
-            module, view.to(module.device), torch.ones(camera.height, camera.width, 1, device=module.device)
-        )[:, 0]
+        ones = torch.ones(camera.height, camera.width, 1, device=module.device)
+        sums += _gathered(module, view.to(module.device), ones)[:, 0]
     return sums
 
 

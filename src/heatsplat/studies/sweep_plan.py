@@ -43,9 +43,10 @@ class SweepPlan(ABC):
 
     def to_compose(self, jobs: Sequence[Overrides]) -> Sequence[Overrides]:
         """Those of the jobs whose configurations show whether those of all can be composed: one of those that are ``alike``."""
-        return list(
-            {tuple(text for text in job if not text.startswith(self.alike)): job for job in reversed(jobs)}.values()
-        )[::-1]
+        first: dict[tuple[str, ...], Overrides] = {}
+        for job in jobs:
+            first.setdefault(tuple(text for text in job if not text.startswith(self.alike)), job)
+        return list(first.values())
 
     @abstractmethod
     def write(self, folder: Path) -> list[Path]:
