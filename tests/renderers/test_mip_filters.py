@@ -53,7 +53,7 @@ def test_pixels_of_the_default_average_over_their_area():
     values, camera = torch.rand(len(means), 1, generator=generator), near()
 
     def image(camera: Camera, **settings) -> torch.Tensor:
-        renderer = Renderer("reference", **settings)
+        renderer = Renderer("cpu", **settings)
         return renderer(means, quats, scales, opacities, values, camera, None, (1,)).features[..., 0]
 
     sampled = image(camera.resized(8 * camera.width, 8 * camera.height), antialiased=True, eps2d=1e-4)

@@ -16,8 +16,13 @@ from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.io.ply import read_splats, write_splats
 from heatsplat.thermal.base import PerGaussian
+from heatsplat.thermal.composed import Composed
 from heatsplat.thermal.static import Static
 from heatsplat.training.init import Initialisation, Pretrained, Voxels
+
+
+class Faint(Static):
+    start_opacity = 0.25
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +37,14 @@ def test_a_gaussian_is_as_large_as_the_distance_to_its_neighbours(parts):
     splats, _ = Initialisation(scale=0.5)(scene, thermal, seed=0)
     size = neighbour_distances(scene.points.float()).square().mean(1).sqrt()
     assert torch.allclose(splats.scales.detach(), 0.5 * size[:, None].expand(-1, 3), rtol=1e-5)
-    assert torch.allclose(splats.opacities.detach(), torch.tensor(0.1))
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+@pytest.mark.parametrize(("asked", "opacity"), [(None, 0.25), (0.5, 0.5)])
+def test_gaussians_are_as_opaque_as_their_model_has_it_unless_asked(parts, wrapped, asked, opacity):
+    thermal = Faint(modality="thermal")
+    splats, _ = Initialisation(opacity=asked)(parts[0], Composed(thermal) if wrapped else thermal, seed=0)
+    assert torch.allclose(splats.opacities.detach(), torch.tensor(opacity))
 
 
 def test_a_gaussian_lies_in_the_plane_of_its_neighbours_and_is_as_thick_as_they_are(parts):
@@ -70,13 +82,13 @@ def test_points_on_a_line_start_as_balls(parts):
         (["method=etgs", "recipe=published"], (1.0, 0.1)),
         (["method=etgs", "init=random"], (1.0, 0.1)),
         (["method=energy_balance"], (0.1, 0.1)),
-        (["method=energy_balance", "start_opacity=0.3"], (0.1, 0.3)),
         (["method=energy_balance", "init.opacity=0.5"], (0.1, 0.5)),
     ],
 )
 def test_published_and_drawn_gaussians_start_as_faint_balls_and_those_of_a_balance_as_faint_discs(asked, start):
-    init = compose(asked)["init"]
-    assert (init["thinnest"], init["opacity"]) == start
+    plain = compose(asked)
+    init, thermal = plain["init"], build(plain["module"]["thermal"])
+    assert (init["thinnest"], init["opacity"] or thermal.start_opacity) == start
 
 
 @pytest.mark.parametrize(

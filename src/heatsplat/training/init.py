@@ -65,7 +65,7 @@ class Initialisation(Start):
         source: "sfm" takes the scene's points, "random" draws ``count`` of them in the box of the points.
         count: number of Gaussians drawn by "random"; for "sfm", points beyond this many are left out by a seeded
             draw. None takes all points.
-        opacity: initial opacity in (0, 1).
+        opacity: initial opacity in (0, 1); None: that of the thermal model (``ThermalModel.start_opacity``).
         scale: factor on the initial size, above 0.
         thinnest: least semi-axis across the plane of the nearest points, as a share of those in it. A Gaussian is as thick as
             these points are, and lies in their plane; at 1 it is a ball.
@@ -80,15 +80,15 @@ class Initialisation(Start):
         self,
         source: str = "sfm",
         count: int | None = None,
-        opacity: float = 0.1,
+        opacity: float | None = None,
         scale: float = 1.0,
         thinnest: float = 1.0,
         separate: bool = False,
     ) -> None:
         if source not in ("sfm", "random"):
             raise ValueError(f"init.source must be 'sfm' or 'random', got '{source}'")
-        if not 0 < opacity < 1:
-            raise ValueError(f"init.opacity must lie in (0, 1), got {opacity}")
+        if opacity is not None and not 0 < opacity < 1:
+            raise ValueError(f"init.opacity must lie in (0, 1), or be null, got {opacity}")
         if scale <= 0 or (count is not None and count < 1):
             raise ValueError(f"init.scale must be above 0 and init.count at least 1, or null, got {scale} and {count}")
         if not 0 < thinnest <= 1:
@@ -106,7 +106,8 @@ class Initialisation(Start):
         if count == 1:
             distances = torch.full((1, 1), LONE_SIZE * scene.extent)
         squared = distances.square().mean(1).clamp(min=MIN_SQUARED_DISTANCE)
-        logit = torch.logit(torch.tensor(self.opacity))
+        opacity = thermal.start_opacity if self.opacity is None else self.opacity
+        logit = torch.logit(torch.tensor(opacity))
         geometry = {
             "means": means,
             "log_scales": (0.5 * squared.log() + np.log(self.scale))[:, None].repeat(1, 3),
