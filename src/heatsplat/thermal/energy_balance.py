@@ -130,7 +130,7 @@ class EnergyBalance(ThermalModel):
     needs = frozenset({"time", "weather", "thermal_range"})
     narrowest_range_k = KELVIN_RANGE
     optional = frozenset({"raw_wind"})
-    start_opacity = 0.1  # attributes of Gaussians that start opaque scatter more, and other days show it (docs/presets.md)
+    start_opacity = 0.1  # attributes of Gaussians that start opaque scatter more: other days show it (docs/presets.md)
     beyond_record = "the recorded weather drives the balance of heat on, and without weather there is no answer"
 
     def __init__(
