@@ -187,11 +187,6 @@ def test_what_was_learned_counts_gaussians_by_what_views_show_of_them(tmp_path, 
     assert "±" not in text and "callbacks=uncertainty" in text
 
 
-def test_no_view_to_tell_what_is_shown_is_refused():
-    with pytest.raises(ValueError, match="callbacks.learned.views must be 1 or more, got 0"):
-        LearnedValues(views=0)
-
-
 def test_how_far_the_value_of_one_gaussian_is_off_stands_beside_where_it_is_asked_for(tmp_path, monkeypatch):
     (row,) = learned(tmp_path, monkeypatch, deviations=True)
     assert row["deviation"] == 0.05

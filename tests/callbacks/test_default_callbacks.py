@@ -38,6 +38,34 @@ def test_every_setting_is_one_that_exists(name):
         assert all(settings[key] == accepted[key].default for key in settings), "file and code have the same defaults"
 
 
+NUMBERS = [
+    (name, key)
+    for name, entry in ENTRIES.items()
+    if entry["_target_"].startswith("heatsplat.callbacks")
+    for key, value in entry.items()
+    if isinstance(value, (int, float)) and not isinstance(value, bool)
+]
+
+
+@pytest.mark.parametrize(("name", "key"), NUMBERS, ids=".".join)
+def test_a_number_that_would_end_the_run_when_it_is_used_is_refused_by_name(name, key):
+    """Most are used when training is over."""
+    with pytest.raises(ValueError, match=re.escape(f"callbacks.{name}.{key} must")):
+        build(name, **{key: -2})
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("costs", "every"), ("costs", "fps_views"), ("costs", "fps_repeats"), ("probes", "times"), ("surfaces", "views"),
+        ("surfaces", "share"), ("turntable", "frames"), ("turntable", "size"), ("statistics", "every"),
+    ],
+)  # fmt: skip
+def test_where_there_has_to_be_one_none_is_refused(name, key):
+    with pytest.raises(ValueError, match=re.escape(f"callbacks.{name}.{key} must")):
+        build(name, **{key: 0})
+
+
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_every_key_has_a_comment(file):
     for line in file.read_text().splitlines():

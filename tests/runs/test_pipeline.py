@@ -320,31 +320,33 @@ def test_settings_that_an_older_heatsplat_did_not_have_are_warned_of_unless_they
     folder, _, _ = trained
     stored = load_checkpoint(folder / "checkpoints" / "last.ckpt")
     for settings in (stored["heatsplat"]["config"], stored["heatsplat"]["config"]["module"]):
-        settings["optim"] = {key: value for key, value in settings["optim"].items() if key != "averaged"}
+        settings["optim"] = {key: value for key, value in settings["optim"].items() if key != "accumulate_from"}
     torch.save(stored, tmp_path / "old.ckpt")
     assert resumed(heatsplat.compose([*QUICK, f"ckpt={tmp_path}/old.ckpt", "max_steps=9"]), tmp_path)["ckpt"]
-    assert "old.ckpt is of an older heatsplat without optim.averaged: they count from here on" in caplog.text
-    with pytest.raises(SceneError, match="was trained with another optim.averaged"):
-        resumed(heatsplat.compose([*QUICK, f"ckpt={tmp_path}/old.ckpt", "optim.averaged=0.2"]), tmp_path)
+    assert "old.ckpt is of an older heatsplat without optim.accumulate_from: they count from here on" in caplog.text
+    with pytest.raises(SceneError, match="was trained with another optim.accumulate_from"):
+        resumed(heatsplat.compose([*QUICK, f"ckpt={tmp_path}/old.ckpt", "optim.accumulate_from=0.2"]), tmp_path)
 
 
 def test_an_unfinished_run_of_an_older_heatsplat_is_told_with_its_settings_and_what_to_do(trained, tmp_path):
     stored = load_checkpoint(trained[0] / "checkpoints" / "last.ckpt")
     for settings in (stored["heatsplat"]["config"], stored["heatsplat"]["config"]["module"]):
-        settings["optim"] = {key: value for key, value in settings["optim"].items() if key != "averaged"}
+        settings["optim"] = {key: value for key, value in settings["optim"].items() if key != "accumulate_from"}
     (tmp_path / "checkpoints").mkdir()
     torch.save(stored, path := tmp_path / "checkpoints" / "step_8.ckpt")
     config = checked(heatsplat.compose([*QUICK, "max_steps=8"]))
-    with pytest.raises(OccupiedError, match="an older heatsplat, which did not have optim.averaged: ckpt=") as told:
+    with pytest.raises(
+        OccupiedError, match="an older heatsplat, which did not have optim.accumulate_from: ckpt="
+    ) as told:
         resumed(config, tmp_path)
     assert f"ckpt={path} hydra.run.dir={tmp_path} goes on from step 8" in str(told.value)
     shutil.copy(trained[0] / "metrics.json", tmp_path)
     with pytest.raises(
-        OccupiedError, match="results of an older heatsplat, which did not have optim.averaged: give another"
+        OccupiedError, match="results of an older heatsplat, which did not have optim.accumulate_from: give another"
     ):
         results_in(tmp_path, config)
-    with pytest.raises(OccupiedError, match=r"with other settings \(optim.averaged\)"):  # that was asked for
-        resumed(checked(heatsplat.compose([*QUICK, "optim.averaged=0.2"])), tmp_path)
+    with pytest.raises(OccupiedError, match=r"with other settings \(optim.accumulate_from\)"):  # that was asked for
+        resumed(checked(heatsplat.compose([*QUICK, "optim.accumulate_from=0.2"])), tmp_path)
 
 
 def test_what_changes_nothing_that_is_learned_is_no_difference(trained):

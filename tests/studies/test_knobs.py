@@ -44,6 +44,13 @@ def numbers_told(*overrides):
     return numbers_of(written, settings, SWEEPER["of"])
 
 
+@pytest.mark.parametrize(("method", "numbers"), [("etgs", (0.6, 0.1)), ("energy_balance", (0.1, 0.5))])
+def test_numbers_that_the_thermal_model_has_are_among_them(method, numbers):
+    told = numbers_told(f"method={method}")
+    assert (told["init.opacity"], told["optim.averaged"]) == numbers
+    assert numbers_told(f"method={method}", "init.opacity=0.3")["init.opacity"] == 0.3
+
+
 @pytest.mark.parametrize(
     ("value", "half", "twice"),
     [

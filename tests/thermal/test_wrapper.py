@@ -47,7 +47,7 @@ class Probe(ThermalModel):
     optional = frozenset({"probed"})
     inseparable = "it is probed as a whole"
     beyond_record = "it probes on"
-    start_opacity = 0.35
+    start_opacity, averaged = 0.35, 0.75
 
     def __init__(self, modality="thermal"):
         super().__init__()
@@ -181,6 +181,7 @@ def test_no_hook_of_a_model_is_left_out():
         "modality_channels",
         "shared_opacity",
         "start_opacity",
+        "averaged",
         "needs",
         "narrowest_range_k",
         "optional",
@@ -199,7 +200,7 @@ def test_what_the_model_inside_answers_comes_out(wrapped):
     assert model.needs >= probe.needs and model.narrowest_range_k == 0.25 and model.optional == probe.optional
     clauses = [type(one).inseparable for one in model.modules() if isinstance(one, Wrapper)]  # from the outside in
     assert model.inseparable == next(filter(None, [*clauses, probe.inseparable]))
-    assert model.start_opacity == 0.35 and model.geometry(splats, QUERY) is MOVED
+    assert (model.start_opacity, model.averaged) == (0.35, 0.75) and model.geometry(splats, QUERY) is MOVED
     if not isinstance(model, ThroughAir):  # whose surfaces are warmer than they are seen
         assert torch.equal(model.temperature(splats, 5.0), probe.temperature(splats, 5.0))
     if not isinstance(model, Composed):  # which has parts of its own to leave out

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from running import TINY, run
+from running import BARE, TINY, run
 
+from heatsplat.composition import compose
+from heatsplat.thermal.energy_balance import EnergyBalance
+from heatsplat.thermal.static import Static
 from heatsplat.training.averaging import Average
 from heatsplat.training.module import SplatTraining
 
@@ -92,11 +95,23 @@ def test_none_is_kept_where_it_is_off(tmp_path):
     assert "average" not in checkpoint["heatsplat"]
 
 
+def test_models_of_weather_average_over_half_a_run_and_others_over_a_tenth_unless_asked(tmp_path, monkeypatch):
+    short = (*BARE, "method=3dgs", "density=fixed", "max_steps=20", "optim.accumulate=1")
+
+    def averaged(*overrides):
+        return run(tmp_path, *short, *overrides)[0].results.run["averaged_updates"]
+
+    assert averaged() == averaged("optim.averaged=0.1") < averaged("optim.averaged=0.25") == 5
+    monkeypatch.setattr(Static, "averaged", EnergyBalance.averaged)
+    assert averaged() == 10 and averaged("optim.averaged=0.25") == 5
+    assert compose(["method=energy_balance", "recipe=published"])["optim"]["averaged"] == 0
+
+
 def test_only_the_last_round_is_averaged(tmp_path):
     module, _ = run(tmp_path, *TAIL, "method=mftg")
     assert module.schedule.restarts and module.results.run["averaged_updates"] < 10
 
 
 def test_a_share_is_from_0_to_1(tmp_path):
-    with pytest.raises(Exception, match="optim.averaged is a share of the run, from 0 to 1, got 2"):
+    with pytest.raises(Exception, match="optim.averaged is a share of the run, from 0 to 1, or null, got 2"):
         run(tmp_path, *TAIL, "method=3dgs", "optim.averaged=2")

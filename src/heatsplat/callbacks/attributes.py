@@ -11,7 +11,7 @@ from torch import Tensor
 
 from heatsplat.callbacks.board import add_picture
 from heatsplat.callbacks.images import file_stem
-from heatsplat.contracts import Frame, SceneData, evenly_spread
+from heatsplat.contracts import Frame, SceneData, check_count, evenly_spread
 from heatsplat.io.pictures import Bar, Panel, colorize, compose, text_panel, write_png
 from heatsplat.io.quantities import impossible, words_and_unit
 from heatsplat.io.tables import write_csv
@@ -37,6 +37,8 @@ class AttributeMaps(pl.Callback):
     """
 
     def __init__(self, val_views: int = 1, test_views: int = 2) -> None:
+        check_count("callbacks.attributes.val_views", val_views, 0)
+        check_count("callbacks.attributes.test_views", test_views, 0)
         self.val_views, self.test_views = val_views, test_views
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
@@ -94,8 +96,7 @@ class LearnedValues(pl.Callback):
     """
 
     def __init__(self, views: int = 32, deviations: bool = False) -> None:
-        if views < 1:
-            raise ValueError(f"callbacks.learned.views must be 1 or more, got {views}")
+        check_count("callbacks.learned.views", views)
         self.views, self.deviations = views, deviations
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:

@@ -8,7 +8,7 @@ import statistics
 import pytorch_lightning as pl
 import torch
 
-from heatsplat.contracts import Camera, evenly_spread
+from heatsplat.contracts import Camera, check_count, evenly_spread
 
 log = logging.getLogger("heatsplat")
 
@@ -32,6 +32,9 @@ class CameraCheck(pl.Callback):
     """
 
     def __init__(self, views: int = 6, steps: int = 15, least_steps: int = 1000) -> None:
+        check_count("callbacks.camera_check.views", views, 0)
+        check_count("callbacks.camera_check.steps", steps)
+        check_count("callbacks.camera_check.least_steps", least_steps, 0)
         self.views, self.steps, self.least_steps = views, steps, least_steps
 
     def on_test_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:

@@ -10,7 +10,7 @@ import pytorch_lightning as pl
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Frame, View
+from heatsplat.contracts import Frame, View, check_count
 
 
 class NotFinite(FloatingPointError):
@@ -29,8 +29,7 @@ class FiniteGuard(pl.Callback):
     """
 
     def __init__(self, every: int = 50) -> None:
-        if every < 1:
-            raise ValueError(f"FiniteGuard(every={every}): checks must be at least 1 step apart")
+        check_count("callbacks.finite.every", every)
         self.every = every
         self._frame: Frame | None = None
 

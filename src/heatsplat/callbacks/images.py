@@ -11,7 +11,7 @@ import pytorch_lightning as pl
 from torch import Tensor
 
 from heatsplat.callbacks.board import add_picture
-from heatsplat.contracts import Frame, SceneData, SceneError, View, check_option, evenly_spread
+from heatsplat.contracts import Frame, SceneData, SceneError, View, check_count, check_option, evenly_spread
 from heatsplat.io.pictures import (
     Panel,
     bounds_of,
@@ -49,6 +49,8 @@ class ImagePanels(pl.Callback):
 
     def __init__(self, val_views: int = 3, test_views: int = 8, figures: str | None = None) -> None:
         check_option("callbacks.images.figures", figures, (None, "pdf", "svg"), SceneError)
+        check_count("callbacks.images.val_views", val_views, 0)
+        check_count("callbacks.images.test_views", test_views, -1)
         self.val_views, self.test_views, self.figures = val_views, test_views, figures
         self._bounds: tuple[float, float] | None = None
         self._chosen: list[int] = []

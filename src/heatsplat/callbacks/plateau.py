@@ -47,7 +47,8 @@ class Plateau(pl.Callback):
     def __init__(self, after: float = 0.3, min_gain: float = 0.02, tail: float = 0.1) -> None:
         if not (0 <= after < 1 and min_gain > 0 and 0 < tail <= 1):
             raise ValueError(
-                f"after must lie in [0, 1), min_gain above 0 and tail in (0, 1], got {after}, {min_gain} and {tail}"
+                "callbacks.plateau.after must lie in [0, 1), min_gain above 0 and tail in (0, 1], "
+                f"got {after}, {min_gain} and {tail}"
             )
         self.after, self.min_gain, self.tail = after, min_gain, tail
         self._variance = 0.0

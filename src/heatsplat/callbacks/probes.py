@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from heatsplat.callbacks.board import add_picture
-from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, evenly_spread
+from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, check_count, evenly_spread
 from heatsplat.io.pictures import figure_picture, literal, write_png
 from heatsplat.io.quantities import clock_of, time_unit
 from heatsplat.io.tables import write_csv
@@ -53,6 +53,8 @@ class TemperatureCurves(pl.Callback):
     """
 
     def __init__(self, count: int = 6, times: int = 32) -> None:
+        check_count("callbacks.probes.count", count, 0)
+        check_count("callbacks.probes.times", times)
         self.count, self.times = count, times
         self._probes: list[Probe] | None = None
         self._dots: list[tuple[list[float], list[float]]] = []

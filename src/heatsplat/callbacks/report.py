@@ -19,7 +19,7 @@ from heatsplat.callbacks.board import board
 from heatsplat.callbacks.describe import describe_data, describe_effects, describe_run, hyperparameters
 from heatsplat.callbacks.images import file_stem
 from heatsplat.callbacks.report_text import cells, effects_table, markdown
-from heatsplat.contracts import Frame, evenly_spread
+from heatsplat.contracts import Frame, check_count, evenly_spread
 from heatsplat.io.files import write_atomically
 from heatsplat.io.page import PAGE_FILE, write_page
 from heatsplat.io.pictures import figure_picture, write_png
@@ -49,6 +49,7 @@ class Report(pl.Callback):
     """
 
     def __init__(self, pictures: int = 4, show: bool = True, html: bool = True) -> None:
+        check_count("callbacks.report.pictures", pictures, 0)
         self.pictures, self.show, self.html = pictures, show, html
 
     def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:

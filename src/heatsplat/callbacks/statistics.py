@@ -8,6 +8,7 @@ import pytorch_lightning as pl
 import torch
 
 from heatsplat.callbacks.board import add_scalars, board
+from heatsplat.contracts import check_count
 
 HISTOGRAM_ROWS = 20_000  # a histogram of more Gaussians looks the same and takes longer
 
@@ -22,6 +23,8 @@ class SplatStatistics(pl.Callback):
     """
 
     def __init__(self, every: int = 50, histogram_every: int = 1000) -> None:
+        check_count("callbacks.statistics.every", every)
+        check_count("callbacks.statistics.histogram_every", histogram_every, 0)
         self.every, self.histogram_every = every, histogram_every
 
     def on_train_batch_end(

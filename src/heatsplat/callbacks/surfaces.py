@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from heatsplat.callbacks.images import scene_bounds
-from heatsplat.contracts import Frame, SceneData, evenly_spread
+from heatsplat.contracts import Frame, SceneData, SceneError, check_count, evenly_spread
 from heatsplat.export.place import Place, placed, unit_in_metres
 from heatsplat.geometry.coverage import DEPTH_TOLERANCE, surface_depth
 from heatsplat.geometry.extremes import Surface, extremes
@@ -47,6 +47,10 @@ class ExtremeSurfaces(pl.Callback):
     """
 
     def __init__(self, views: int = 12, share: float = 0.03, count: int = 4) -> None:
+        check_count("callbacks.surfaces.views", views)
+        check_count("callbacks.surfaces.count", count, 0)
+        if not 0 < share <= 1:
+            raise SceneError(f"callbacks.surfaces.share must lie in (0, 1], got {share}")
         self.views, self.share, self.count = views, share, count
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:

@@ -13,6 +13,7 @@ import pytorch_lightning as pl
 import torch
 
 from heatsplat.callbacks.board import add_scalars
+from heatsplat.contracts import check_count
 from heatsplat.metrics.definitions import COSTS
 
 OF_EVERY_TEST = {"render_fps", "peak_memory_mb", "gaussians"}  # costs that a test measures, even without training
@@ -48,6 +49,10 @@ class CostMeter(pl.Callback):
     """
 
     def __init__(self, every: int = 50, warmup_steps: int = 3, fps_views: int = 4, fps_repeats: int = 10) -> None:
+        check_count("callbacks.costs.every", every)
+        check_count("callbacks.costs.warmup_steps", warmup_steps, 0)
+        check_count("callbacks.costs.fps_views", fps_views)
+        check_count("callbacks.costs.fps_repeats", fps_repeats)
         self.every, self.warmup_steps = every, warmup_steps
         self.fps_views, self.fps_repeats = fps_views, fps_repeats
         self.seconds = {"train": 0.0, "warmup": 0.0, "evaluation": 0.0}

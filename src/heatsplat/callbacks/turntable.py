@@ -8,6 +8,7 @@ import pytorch_lightning as pl
 from PIL import Image
 
 from heatsplat.callbacks.images import scene_bounds
+from heatsplat.contracts import check_count
 from heatsplat.io.pictures import Bar, bar_unit, compose, image_panel
 from heatsplat.io.quantities import clock_of, moment
 from heatsplat.shots import shot_frames
@@ -28,6 +29,8 @@ class Turntable(pl.Callback):
     """
 
     def __init__(self, frames: int = 24, size: int = 320, milliseconds: int = 120) -> None:
+        for name, value in {"frames": frames, "size": size, "milliseconds": milliseconds}.items():
+            check_count(f"callbacks.turntable.{name}", value)
         self.frames, self.size, self.milliseconds = frames, size, milliseconds
 
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:

@@ -26,7 +26,7 @@ class ViewerPage(pl.Callback):
     """
 
     def __init__(self, cameras: int = CAMERAS) -> None:
-        check_count("cameras", cameras)
+        check_count("callbacks.viewer.cameras", cameras)
         self.cameras = cameras
 
     def on_test_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:

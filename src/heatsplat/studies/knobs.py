@@ -7,6 +7,7 @@ import re
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ from heatsplat.studies.sweep_plan import FolderOf, Overrides, SweepPlan
 from heatsplat.studies.sweeps import collect, write_sweep
 
 DEFAULT = "default"  # name of the row in which nothing is changed
+
+# Settings that are null where the thermal model has a number of its own, and the attribute that has it.
+OF_THE_MODEL = {"init.opacity": "start_opacity", "optim.averaged": "averaged"}
 
 Number = int | float | list[int | float]
 
@@ -74,7 +78,7 @@ def numbers_of(written: Mapping[str, Any], settings: Mapping[str, Any], of: str 
     """The numbers of a recipe: dotted key -> number, or list of numbers.
 
     Without those that are 0 or not finite, and without those that follow another setting, such as ``${max_steps}``: they would
-    be the same knob twice.
+    be the same knob twice. What is null as the thermal model has a number of its own is this number.
 
     Args:
         written: its settings as they are written.
@@ -87,10 +91,22 @@ def numbers_of(written: Mapping[str, Any], settings: Mapping[str, Any], of: str 
     keys = [
         key for section in listed(of) for key, value in walk({section: at(written, section)}) if not _follows(value)
     ]
-    numbers = {key: value for key in keys if _is_number(value := at(settings, key))}
+    known = {key: at(settings, key) for key in keys} | _of_the_model(settings)
+    numbers = {key: known[key] for key in keys if _is_number(known[key])}
     if not numbers:
         raise SceneError(f"hydra.sweeper.knobs.of=[{','.join(listed(of))}]: the recipe has no numbers there")
     return numbers
+
+
+def _of_the_model(settings: Mapping[str, Any]) -> dict[str, Number]:
+    """Numbers that the thermal model has for settings that are null."""
+    null = [key for key in OF_THE_MODEL if at(settings, key) is None]
+    target = at(settings, "thermal._target_")
+    if not null or target is None:
+        return {}
+    module, _, name = target.rpartition(".")
+    model = getattr(import_module(module), name)
+    return {key: getattr(model, OF_THE_MODEL[key]) for key in null}
 
 
 def _follows(written: Any) -> bool:

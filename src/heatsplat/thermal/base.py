@@ -259,7 +259,9 @@ class ThermalModel(Heat):
         modality_channels: channels of the image and of its companions, such as (1, 3); their sum is the number of
             features.
         shared_opacity: one opacity serves the image and its companions; otherwise each has its own.
-        start_opacity: with which its Gaussians start at points of a scene, in (0, 1), where nobody asks for another.
+        start_opacity: with which its Gaussians start at points of a scene, in (0, 1), where nobody asks for another
+            (``Initialisation``).
+        averaged: share of a run, at its end, over whose updates parameters are averaged; likewise (``Optimisation``).
         rows: what a row of the splats is, GAUSSIANS or ANCHORS; or NOTHING for a ``Field``, whose splats have no rows.
             Parts of a run that touch rows say which they know.
         per_row: Gaussians that a row becomes in ``geometry``; those of row i begin at i * per_row, and ``Query.ids`` and
@@ -275,6 +277,7 @@ class ThermalModel(Heat):
     modality_channels: tuple[int, ...] = (1,)
     shared_opacity: bool = False
     start_opacity: float = 0.6
+    averaged: float = 0.1
 
     @property
     def opacity_channels(self) -> tuple[int, ...]:

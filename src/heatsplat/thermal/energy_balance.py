@@ -130,7 +130,10 @@ class EnergyBalance(ThermalModel):
     needs = frozenset({"time", "weather", "thermal_range"})
     narrowest_range_k = KELVIN_RANGE
     optional = frozenset({"raw_wind"})
-    start_opacity = 0.1  # attributes of Gaussians that start opaque scatter more: other days show it (docs/presets.md)
+    # On days that no image shows, small errors of all parameters add up, so the mean is over more updates than elsewhere; and
+    # attributes of Gaussians that start opaque scatter more (docs/presets.md).
+    averaged = 0.5
+    start_opacity = 0.1
     beyond_record = "the recorded weather drives the balance of heat on, and without weather there is no answer"
 
     def __init__(

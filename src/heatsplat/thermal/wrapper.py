@@ -52,7 +52,8 @@ class Wrapper(ThermalModel):
         self.narrowest_range_k = max(self.narrowest_range_k, *(member.narrowest_range_k for member in every))
         self.inseparable = self.inseparable or next(filter(None, (member.inseparable for member in every)), "")
         self.stays_here = next(filter(None, (model.stays_here for model in models)), "")
-        self.shared_opacity, self.start_opacity = models[0].shared_opacity, models[0].start_opacity
+        self.shared_opacity = models[0].shared_opacity
+        self.start_opacity, self.averaged = models[0].start_opacity, models[0].averaged
         explained = [(name, count) for model in models for name, count in _images_of(model)]
         if own_channels:
             explained.insert(0, ("thermal", own_channels))

@@ -125,6 +125,7 @@ class SplatTraining(SceneModel):
         self._pixels = 0  # of the last image
         self._checked_trained = False  # after the first step, which may make parameters
         self._average = Average()
+        self._averaged = thermal.averaged if optim.averaged is None else optim.averaged
         self._waiting: dict[str, Any] = {}  # gradients of a checkpoint that was written between two updates
 
     # Set-up ------------------------------------------------------------------------------------------
@@ -385,7 +386,7 @@ class SplatTraining(SceneModel):
             for group in inner.param_groups:
                 if group["name"] in self._declared:
                     group |= penalties(self._declared[group["name"]], len(self.splats))
-        if update and self.schedule.left(step + 1) < self.optim.averaged:
+        if update and self.schedule.left(step + 1) < self._averaged:
             self._average.take(self._learned())
 
     def _check_change(self, change: Any, more: int) -> None:

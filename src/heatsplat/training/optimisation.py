@@ -43,7 +43,8 @@ class Optimisation:
         accumulate: views whose gradients are summed for one update, rounded; 1: every view has an update of its own.
         accumulate_from: share of the run, or of each of its rounds, after which that begins.
         averaged: share of the run, or of the last of its rounds, at whose end parameters become their mean over the
-            updates in it (``training.averaging``); 0: they stay as the last update left them.
+            updates in it (``training.averaging``); 0: they stay as the last update left them; None: the share that the
+            thermal model has (``ThermalModel.averaged``).
         decoupled: decay of opacities and sizes beside Adam, or None.
 
     Raises:
@@ -64,13 +65,17 @@ class Optimisation:
         eps: float = 1e-15,
         accumulate: float = 1,
         accumulate_from: float = 0.5,
-        averaged: float = 0.0,
+        averaged: float | None = 0.0,
         decoupled: DecoupledDecay | None = None,
     ) -> None:
         if accumulate < 1:
             raise ValueError(f"optim.accumulate is a number of views and at least 1, got {accumulate}")
-        if not 0 <= averaged <= 1:
-            raise ValueError(f"optim.averaged is a share of the run, from 0 to 1, got {averaged}")
+        if not 0 <= accumulate_from <= 1:
+            raise ValueError(f"optim.accumulate_from is a share of the run, from 0 to 1, got {accumulate_from}")
+        if averaged is not None and not 0 <= averaged <= 1:
+            raise ValueError(f"optim.averaged is a share of the run, from 0 to 1, or null, got {averaged}")
+        if steps < 1:
+            raise ValueError(f"optim.steps must be at least 1, got {steps}")
         if min(means_end, decay) < 0:
             raise ValueError(f"optim.means_end and decay must not be negative, got {means_end} and {decay}")
         check_numbers("optim.betas", betas, 2)
