@@ -86,6 +86,7 @@ def test_no_number_or_text_of_a_command_has_the_name_of_a_group(path):
     [
         ("every must be 1 or more", "density: every must be 1 or more"),
         ("density.every must be 1 or more", "density.every must be 1 or more"),
+        ("leave out budget, or density.every", "leave out budget, or density.every"),
     ],
 )
 def test_a_setting_that_a_class_of_the_user_refuses_needs_no_traceback(told, printed):

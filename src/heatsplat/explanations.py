@@ -51,8 +51,9 @@ def explain(error: Exception, command: str, arguments: Sequence[str]) -> str | N
 
 def expected(error: BaseException) -> BaseException | None:
     """The error behind ``error`` that is the user's to mend and needs no traceback, or None."""
-    outer = error
     while error is not None:
+        if _of_building(error):  # it says where, and its cause what
+            return error
         if isinstance(error, SceneError | FileNotFoundError | ImportError | FloatingPointError):
             return error
         if isinstance(error, OSError) and error.errno in NO_PLACE:
@@ -60,7 +61,7 @@ def expected(error: BaseException) -> BaseException | None:
         if isinstance(error, ValueError) and _raised_here(error):  # of a setting, once the scene is known
             return error
         error = error.__cause__
-    return outer if _of_building(outer) else None  # of a class of the user's own
+    return None
 
 
 def sentence(error: BaseException) -> str:
@@ -90,8 +91,10 @@ def _of_composing(error: Exception, command: str, arguments: Sequence[str]) -> s
 def _of_building(error: BaseException) -> str | None:
     """What is printed where a class did not take its settings; None for other errors."""
     place, cause = _place(error), error.__cause__
-    if place and isinstance(cause, ValueError):
-        return str(cause) if str(cause).startswith(f"{place}.") else f"{place}: {cause}"
+    if place and isinstance(cause, ValueError) and not isinstance(cause, SceneError):  # which names the file or the key
+        # Most name their setting, such as "normals.views must be ..." of what is built as surroundings.normals.
+        named = re.search(rf"\b{re.escape(place.rpartition('.')[2])}[.=]\S", str(cause))
+        return str(cause) if named else f"{place}: {cause}"
     if place and isinstance(cause, TypeError) and _of_settings(cause):
         return f"{place}: {cause} (HYDRA_FULL_ERROR=1 shows where)"
     return None

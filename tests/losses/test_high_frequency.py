@@ -154,7 +154,7 @@ def test_another_factor_is_named():
     [
         ({"inner": 2}, "odd sides of windows, the first smaller, got 2 and 7"),
         ({"outer": 1}, "odd sides of windows, the first smaller, got 1 and 1"),
-        ({"gamma_pixel": -1.0}, "gammas must not be negative and factor at least 1, got -1.0"),
+        ({"gamma_pixel": -1.0}, "gamma_pixel and gamma_gradient must not be negative and factor at least 1, got -1.0"),
     ],
 )
 def test_options_out_of_range(options, message):

@@ -152,3 +152,9 @@ def test_weight_zero_is_absent():
             raise AssertionError("a term of weight zero was evaluated")
 
     assert Loss({"gradient": Weighted(Forbidden(), 0.0), "guided_variation": None})(inputs()) == {}
+
+
+@pytest.mark.parametrize("make", [lambda: GuidedVariation("rgb", beta=-1.0), lambda: PhysicalPrior(tolerance=-1.0)])
+def test_what_may_not_be_negative_is_refused(make):
+    with pytest.raises(ValueError, match=r"(beta|tolerance) must not be negative, got -1\.0"):
+        make()

@@ -82,8 +82,8 @@ def test_rounding_of_a_clock_is_no_gap():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"gain": 0.0}, r"gain must lie in \(0, 1\]"),
-        ({"gain": 1.5}, r"gain must lie in \(0, 1\]"),
+        ({"gain": 0.0}, r"frequency_gain must lie in \(0, 1\]"),
+        ({"gain": 1.5}, r"frequency_gain must lie in \(0, 1\]"),
         ({"tau_min": 0.0}, "tau_min must be"),
         ({"tau_min": math.nan}, "tau_min must be"),
         ({"separation": -0.1}, "separation must be"),

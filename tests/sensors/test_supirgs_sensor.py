@@ -202,9 +202,9 @@ def test_a_known_sensor_is_recovered_from_images_of_known_scenes():
     [
         (lambda: Calibration(grid=1), "needs 2 nodes along each side or more, got 1"),
         (lambda: Calibration(grid=2), "tell no gain from vignetting: give a grid of 3 or more"),
-        (lambda: Calibration(gain_max=-0.1), "bounds must not be negative, got -0.1"),
+        (lambda: Calibration(gain_max=-0.1), "gain_max, bias_max and vignetting_max must not be negative, got -0.1"),
         (lambda: GainControl(stretch_max=1.0), "stretch_max must be above 1 and shift_max not negative, got 1.0"),
-        (lambda: Tone(width=1), "tone needs width >= 2 and bounds >= 0, got 1"),
+        (lambda: Tone(width=1), "width must be at least 2, gain_max and offset_max not negative, got 1"),
     ],
 )
 def test_options_out_of_range(make, message):

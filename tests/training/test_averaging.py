@@ -10,6 +10,7 @@ from heatsplat.thermal.energy_balance import EnergyBalance
 from heatsplat.thermal.static import Static
 from heatsplat.training.averaging import Average
 from heatsplat.training.module import SplatTraining
+from heatsplat.training.optimisation import Optimisation
 
 TAIL = (*TINY, "max_steps=40", "test=false", "optim.averaged=0.25", "optim.accumulate=3", "optim.accumulate_from=0.2")
 
@@ -113,5 +114,8 @@ def test_only_the_last_round_is_averaged(tmp_path):
 
 
 def test_a_share_is_from_0_to_1(tmp_path):
+    for options in ({"accumulate_from": -1.0}, {"steps": -1}):
+        with pytest.raises(ValueError, match=f"optim.{next(iter(options))} .*, got -1"):
+            Optimisation(**options)
     with pytest.raises(Exception, match="optim.averaged is a share of the run, from 0 to 1, or null, got 2"):
         run(tmp_path, *TAIL, "method=3dgs", "optim.averaged=2")

@@ -140,6 +140,7 @@ def test_before_its_start_nothing_is_learned():
         ({"start": 1.0}, "start in"),
         ({"weight": -1.0}, "weight"),
         ({"lr": None}, "lr must be a number"),
+        ({"lr_end": -1.0}, "lr_end of 0 or more"),
         ({"align_steps": 1.5}, "align_steps"),
     ],
 )

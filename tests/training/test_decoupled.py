@@ -76,3 +76,5 @@ def test_frozen_tensors_do_not_decay():
 def test_a_negative_rate_is_refused():
     with pytest.raises(ValueError, match="must not be negative"):
         DecoupledDecay(opacity=-math.inf)
+    with pytest.raises(ValueError, match="stop are steps of 0 or more, got 3000, 1000 and -1"):
+        DecoupledDecay(stop=-1)

@@ -176,6 +176,10 @@ def test_names_that_fit_nothing_are_told(caplog):
 def test_errors():
     with pytest.raises(ValueError, match="groups must be a list of names of parameter groups, got 'sh0'"):
         Freeze("sh0")
+    with pytest.raises(ValueError, match="start and stop are steps of 0 or more, got -1 and None"):
+        Freeze(["sh0"], start=-1)
+    with pytest.raises(ValueError, match="start and stop are steps of 0 or more, got 0 and -5"):
+        Freeze(["sh0"], stop=-5)
     with pytest.raises(ValueError, match="cycle must be at least 1 step, or null, got 0"):
         Freeze(["sh0"], cycle=0)
     with pytest.raises(ValueError, match=r"share lies in \[0, 1\] and turn in 0 to turns - 1, got 0.5, 2 of 2"):

@@ -66,11 +66,16 @@ class GuidedVariation(LossTerm):
 
     Args:
         guide: companion whose target guides, such as "rgb".
-        beta: how fast an edge of the guide lifts the constraint.
+        beta: how fast an edge of the guide lifts the constraint, 0 or more.
         modality: which image is smoothed: that of a companion, or None for the model's own.
+
+    Raises:
+        ValueError: ``beta`` is negative.
     """
 
     def __init__(self, guide: str, beta: float = 10.0, modality: str | None = None) -> None:
+        if beta < 0:
+            raise ValueError(f"beta must not be negative, got {beta}")
         self.guide, self.beta, self.modality = guide, beta, modality
 
     def __call__(self, inputs: LossInputs) -> Tensor:

@@ -48,7 +48,8 @@ class HighFrequency(LossTerm):
             raise ValueError(f"inner and outer are odd sides of windows, the first smaller, got {inner} and {outer}")
         if min(gamma_pixel, gamma_gradient) < 0 or factor < 1:
             raise ValueError(
-                f"gammas must not be negative and factor at least 1, got {gamma_pixel}, {gamma_gradient}, {factor}"
+                "gamma_pixel and gamma_gradient must not be negative and factor at least 1, "
+                f"got {gamma_pixel}, {gamma_gradient}, {factor}"
             )
         self.factor = factor
         self._teacher_images = TeacherImages(

@@ -29,7 +29,7 @@ class PhysicalPrior(LossTerm):
     Gaussians without both attributes have no such prior, and the term is absent.
 
     Args:
-        tolerance: δ.
+        tolerance: δ, 0 or more.
         of: "activated" takes ε and ρ as they act, the sigmoid of the constant harmonic: B is then zero by construction
             and the sum is what counts. "coefficients" takes the coefficients of the constant harmonics themselves, as
             the paper prints; it pulls ε and ρ towards 1/2, as a coefficient in [0, 1] is a share of 0.50 to 0.57.
@@ -38,7 +38,7 @@ class PhysicalPrior(LossTerm):
         emissivity, reflectance: names of the tensors, [N, 1, 1] before the sigmoid.
 
     Raises:
-        ValueError: ``of`` or ``reduction`` is unknown.
+        ValueError: ``of`` or ``reduction`` is unknown, or ``tolerance`` is negative.
     """
 
     def __init__(
@@ -51,6 +51,8 @@ class PhysicalPrior(LossTerm):
     ) -> None:
         check_option("of", of, OF)
         check_option("reduction", reduction, REDUCTIONS)
+        if tolerance < 0:
+            raise ValueError(f"tolerance must not be negative, got {tolerance}")
         self.tolerance, self.activated, self.summed = tolerance, of == "activated", reduction == "sum"
         self.names = emissivity, reflectance
 

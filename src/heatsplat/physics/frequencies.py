@@ -52,7 +52,7 @@ def frequency_grid(
     if count != int(count) or count < 0:
         raise ValueError(f"count of frequencies must be a whole number of at least 0, got {count}")
     if not 0 < gain <= 1:
-        raise ValueError(f"gain must lie in (0, 1], got {gain}; 0.7071 is the half-power point")
+        raise ValueError(f"frequency_gain must lie in (0, 1], got {gain}; 0.7071 is the half-power point")
     if not 0 <= separation < math.inf:
         raise ValueError(f"separation must be a number of cycles of at least 0, got {separation}")
     gaps = _positive_gaps(timestamps)

@@ -51,7 +51,9 @@ class Calibration(SensorPart):
                 "four nodes lie equally far out and tell no gain from vignetting: give a grid of 3 or more"
             )
         if min(gain_max, bias_max, vignetting_max) < 0:
-            raise ValueError(f"bounds must not be negative, got {gain_max}, {bias_max}, {vignetting_max}")
+            raise ValueError(
+                f"gain_max, bias_max and vignetting_max must not be negative, got {gain_max}, {bias_max}, {vignetting_max}"
+            )
         self.gain_max, self.bias_max, self.vignetting_max = gain_max, bias_max, vignetting_max
         self.weight, self.lr, self.lr_end = weight, lr, lr_end
         self.raw_gain = nn.Parameter(torch.zeros(grid, grid)) if gain_max > 0 else None

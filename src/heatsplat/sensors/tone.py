@@ -52,7 +52,9 @@ class Tone(SensorPart):
     ) -> None:
         super().__init__()
         if width < 2 or min(gain_max, offset_max) < 0:
-            raise ValueError(f"tone needs width >= 2 and bounds >= 0, got {width}, {gain_max}, {offset_max}")
+            raise ValueError(
+                f"width must be at least 2, gain_max and offset_max not negative, got {width}, {gain_max}, {offset_max}"
+            )
         self.weight, self.lr, self.lr_end = weight, lr, lr_end
         self.straight, self.exact = straight, exact
         first, second, last = nn.Linear(1, width), nn.Linear(width, width), nn.Linear(width, 2)

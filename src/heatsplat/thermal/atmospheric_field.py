@@ -80,7 +80,7 @@ class AtmosphericField(Wrapper):
         check_option("positions", positions, POSITIONS)
         if width < 1 or depth < 1 or position_frequencies < 1 or time_frequencies < 1:
             raise ValueError(
-                "width, depth and the numbers of frequencies must be at least 1, got "
+                "width, depth, position_frequencies and time_frequencies must be at least 1, got "
                 f"{width}, {depth}, {position_frequencies}, {time_frequencies}"
             )
         if skip is not None and not 1 <= skip < depth:

@@ -90,9 +90,10 @@ class RefinedCameras(Cameras):
         check_count("cameras.align_steps", align_steps, least=0)
         for name, value in (("start", start), ("weight", weight), ("lr", lr), ("lr_end", lr_end)):
             check_numbers(name, value)
-        if not 0 <= start < 1 or weight < 0 or lr < 0:
+        if not 0 <= start < 1 or min(weight, lr, lr_end) < 0:
             raise ValueError(
-                f"cameras need start in [0, 1), and weight and lr of 0 or more, got {start}, {weight} and {lr}"
+                "cameras need start in [0, 1), and weight, lr and lr_end of 0 or more, "
+                f"got {start}, {weight}, {lr} and {lr_end}"
             )
         self.start, self.weight, self.lr, self.lr_end, self.align_steps = start, weight, lr, lr_end, align_steps
         self.moves = nn.Parameter(torch.zeros(0, 6))

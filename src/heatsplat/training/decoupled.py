@@ -38,6 +38,11 @@ class DecoupledDecay:
             raise ValueError(
                 f"optim.decoupled: opacity and size must not be negative and clip is positive, got {opacity}, {size}, {clip}"
             )
+        if min(opacity_start, size_start, stop) < 0:
+            raise ValueError(
+                "optim.decoupled: opacity_start, size_start and stop are steps of 0 or more, "
+                f"got {opacity_start}, {size_start} and {stop}"
+            )
         self.opacity, self.size, self.clip = opacity, size, clip
         self.opacity_start, self.size_start, self.stop = opacity_start, size_start, stop
 

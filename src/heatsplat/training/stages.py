@@ -50,6 +50,8 @@ class Freeze:
     ) -> None:
         if not groups or isinstance(groups, str):
             raise ValueError(f"groups must be a list of names of parameter groups, got {groups!r}")
+        if start < 0 or (stop is not None and stop < 0):
+            raise ValueError(f"start and stop are steps of 0 or more, got {start} and {stop}")
         if cycle is not None and cycle < 1:
             raise ValueError(f"cycle must be at least 1 step, or null, got {cycle}")
         if not 0 <= share <= 1 or not 0 <= turn < turns:
