@@ -11,6 +11,8 @@ def test_an_option_that_there_is_not_is_told_those_that_there_are():
     check_option("codec", "h264", ("auto", "h264"))
     with pytest.raises(SceneError, match="^codec must be one of auto, h264, got 'h265'$"):
         check_option("codec", "h265", ("auto", "h264"), SceneError)
+    with pytest.raises(ValueError, match="^figures must be one of null, pdf, got 'png'$"):
+        check_option("figures", "png", (None, "pdf"))
 
 
 @pytest.mark.parametrize("wrong", ["x", "12", True, None, [1.0], math.nan, math.inf])

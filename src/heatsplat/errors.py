@@ -15,7 +15,8 @@ class SceneError(ValueError):
 def check_option(name: str, value: Any, known: Iterable[Any], error: type[ValueError] = ValueError) -> None:
     """Raises ``error``, with the values that are known, where an option has another one."""
     if value not in known:
-        raise error(f"{name} must be one of {', '.join(map(str, known))}, got '{value}'")
+        options = ("null" if option is None else str(option) for option in known)  # as they are written
+        raise error(f"{name} must be one of {', '.join(options)}, got '{value}'")
 
 
 def check_numbers(
