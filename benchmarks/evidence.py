@@ -85,6 +85,18 @@ better foreseen than surfaces that relax before a camera with an offset and a ga
 behind air that takes a share of its own from each. If that camera foresees better, it cannot be told. The gain is 1.4 to 4.6 dB
 on `heated` (tiny, 16 to 31 images), and -0.1 to -3.1 dB on six random scenes without a lamp whose points seemed to answer one.
 
+That the scene changes is certain even then, if surfaces that relax are clearly better foreseen than levels, before that camera
+and behind such air. Beside a common course, a flow of heat between neighbours is absent if contrasts between them answer it at
+most 1.17 times as fast as the levels that they share, for a flow adds to that rate (0.5 to 1.1 times on 15 recordings with a lamp
+and no flow). If they answer faster, it cannot be told: bodies of two rates do so, too.
+
+**Heat goes on between images.** A camera may jump from image to image; surfaces go on between them. Heat that would take the
+place of an effect in doubt is absent if one or two courses over time do not foresee images that are left out whole, on the line
+between their neighbours in time (`effects/joint/foreseen.py`), though a decay and a swing as large as the error expected of an
+observation, added to the images, would be foreseen. On 14 random scenes that change (14 frames or more) courses gain 1.7 to
+7.1 dB; on four still ones they gain at most 0.1 dB. A gain that walks slowly is foreseen as heat is (2 to 7 dB on three), and
+leaves heat in doubt.
+
 **Emissivity and angle.** Surfaces emit less towards their sides: smooth dielectrics only at grazing angles (Schlick's law, the
 fifth power of 1 - cos θ), rough ones earlier (the first power). The joint fit has one falloff for all points
 (`effects/physical/directional_emissivity.py`) and chooses the power. Harmonics of each point also make up for normals that are

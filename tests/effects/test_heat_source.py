@@ -1,6 +1,7 @@
 """What drives a scene, and which patterns of a camera show beside it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,8 +12,11 @@ from heatsplat.effects.heat_source import KNOWN, NAME, PATTERNS, Source
 from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.certainty import Certainty
 from heatsplat.effects.joint.evidence import judged
+from heatsplat.effects.joint.fit import fit_of
 from heatsplat.effects.joint.held_out import HeldOut
+from heatsplat.effects.joint.model import Model
 from heatsplat.effects.physical import fixed_pattern, harmonic_source, relaxation, vignetting
+from tests.effects.tracks import FRAMES, TIMES_S, data_of, drawn, levels
 
 EFFECTS = [one.EFFECT for one in (relaxation, harmonic_source, fixed_pattern, vignetting)]
 
@@ -79,7 +83,7 @@ def test_a_lamp_that_no_camera_explains_as_well_is_certain_with_what_stands_on_i
 
 @pytest.mark.parametrize(("db", "sure", "doubted"), [(1.0, True, False), (0.2, False, None), (-0.2, False, True)])
 def test_a_camera_that_explains_images_better_leaves_the_source_in_doubt(even, db, sure, doubted):
-    known = replace(even.beside_source, gain=HeldOut(db, 5.0, 36), sure=sure)
+    known = replace(even.beside_source, gain=HeldOut(db, 5.0, 36), sure=sure, relaxes=False)
     if doubted is None:
         assert known.told == {}
         return
@@ -113,3 +117,21 @@ def test_what_is_foreseen_comes_from_other_images_and_counts_in_errors():
     values[:, 7] = 1e9
     assert heat_source._foreseen(values, weights, mean) == pytest.approx(found, rel=0.2)
     assert heat_source._foreseen(1e6 * values, weights, mean) <= heat_source.FARTHEST
+
+
+def test_surfaces_that_relax_before_any_camera_are_certain_whatever_drives_them(even):
+    assert even.beside_source.relaxes
+    known = replace(even.beside_source, gain=HeldOut(-0.2, 5.0, 36), sure=False)
+    doubts = Certainty(*even.joint, known.told).doubts
+    assert doubts[NAME] == heat_source.CAMERA and "relaxation" not in doubts
+
+
+def test_levels_before_a_camera_that_jumps_do_not_relax():
+    jumping = 0.5 + (levels() - 0.5) * (1.0 + 0.1 * drawn(FRAMES, seed=9))
+    fit = fit_of(replace(data_of(jumping), ambient=0.0))
+    seen = SimpleNamespace(
+        joint=(fit, Model.of(relaxation=1, harmonic_source=1)),
+        obs=SimpleNamespace(times_s=TIMES_S),
+        scene=SimpleNamespace(record=(0.0, float(TIMES_S[-1]))),
+    )
+    assert not heat_source.beside(seen, torch.ones(64, dtype=torch.float64)).relaxes

@@ -15,7 +15,7 @@ from heatsplat.effects.joint.courses import DECAYS_FEW
 from heatsplat.effects.joint.data import MIN_FREE
 from heatsplat.effects.joint.held_out import HeldOut
 from heatsplat.effects.joint.terms import Own, Path
-from heatsplat.physics.common_course import RATES, common_course, least_squares, response_table
+from heatsplat.physics.common_course import RATES, common_course, least_squares, response
 from heatsplat.physics.frequencies import default_tau_min, frequency_grid
 
 if TYPE_CHECKING:
@@ -61,24 +61,17 @@ class Source:
 def source(inspected: Inspection, count: int) -> Source:
     """What drives a scene whose points share ``count`` courses over time beside any relaxation."""
     found = Source(harmonics(inspected, count))
-    fit, model = inspected.joint
-    data = fit.data
-    if data.ambient is None or fit.terms(model, Path):
+    seen = answering(inspected)
+    if seen is None:
         return found
-    added = sum(fit.contributions(model).values())
-    values, weights = data.tracks.values - added - data.ambient, fit.weights
-    own = 2 * len(RATES)
-    counted = (weights > 0).sum(1) >= own + MIN_FREE
-    if not counted.any():
-        return found
-    weights = weights[counted]
-    values, spans = torch.where(weights > 0, values[counted], 0.0), _spans(inspected)
+    values, weights, _ = seen
+    times = spans(inspected)
     phases = (inspected.obs.times_s - inspected.scene.record[0])[:, None] * frequencies(inspected, found.harmonics)
-    basis = torch.cat([torch.exp(-spans[:, None] * RATES_OF_POINTS), phases.cos(), phases.sin()], 1)
-    course, _ = common_course(values, weights, spans)
+    basis = torch.cat([torch.exp(-times[:, None] * RATES_OF_POINTS), phases.cos(), phases.sin()], 1)
+    course, _ = common_course(values, weights, times)
 
     def answered(known: Tensor) -> Tensor:
-        return torch.where(known > 0, values, 0.0) - common_course(values, known, spans, start=course)[1]
+        return torch.where(known > 0, values, 0.0) - common_course(values, known, times, start=course)[1]
 
     return replace(
         found,
@@ -88,6 +81,22 @@ def source(inspected: Inspection, count: int) -> Source:
             values, weights, lambda known: least_squares(values, known, basis, HARMONIC_RIDGE)[0] @ basis.T
         ),
     )
+
+
+def answering(inspected: Inspection) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Of the points that are seen often enough to say how they answer a source, without what the camera adds: excess over the
+    surroundings [P, F], 0 where it was not seen, weights [P, F], and places [P, 3]. None where there are none, where nobody
+    knows the surroundings, and where a path takes away some of it."""
+    fit, model = inspected.joint
+    data = fit.data
+    if data.ambient is None or fit.terms(model, Path):
+        return None
+    values = data.tracks.values - sum(fit.contributions(model).values()) - data.ambient
+    counted = (fit.weights > 0).sum(1) >= 2 * len(RATES) + MIN_FREE
+    if not counted.any():
+        return None
+    weights = fit.weights[counted]
+    return torch.where(weights > 0, values[counted], 0.0), weights, data.tracks.points[counted]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,28 +112,28 @@ class Known:
         uneven: whether a camera's patterns are clearly there.
         gain: over surfaces that relax before a camera with an offset and a gain of its own in each image, where left out.
         sure: whether that is clear, as what it gains over air that takes a share of its own from each image.
+        relaxes: whether surfaces clearly do before such a camera, and behind such air, whatever drives them.
     """
 
     certainty: Certainty
     uneven: bool
     gain: HeldOut
     sure: bool
+    relaxes: bool
 
     @property
     def told(self) -> dict[str, str]:
         """What it says of the effects of a driven scene (``Certainty``)."""
         if self.sure:
             return dict.fromkeys(DRIVEN, "")
-        return dict.fromkeys(DRIVEN, CAMERA) if self.gain.db < 0 else {}
+        told = dict.fromkeys(DRIVEN, CAMERA) if self.gain.db < 0 else {}
+        return told | {"relaxation": ""} if self.relaxes else told
 
 
 def beside(inspected: Inspection, course: Tensor) -> Known:
     """What images show beside a source whose power over the record is ``course`` [K] (``physics.common_course``)."""
     fit, model = inspected.joint
-    spans = _spans(inspected)
-    table = response_table(RATES_OF_POINTS, len(course))
-    answers = torch.stack([table.exact(float(at)) @ course for at in spans])
-    basis = torch.cat([torch.exp(-spans[:, None] * RATES_OF_POINTS), answers], 1)
+    basis = torch.cat(response(course, spans(inspected), RATES_OF_POINTS), 1)
     effect = replace(
         fit.data.effects[NAME],
         term=Own(basis=lambda at, kind: basis, kinds=lambda at: (KNOWN,), in_time=True),
@@ -139,10 +148,15 @@ def beside(inspected: Inspection, course: Tensor) -> Known:
     shows = gain.db > LEAST_DB and gain.sigmas > MIN_SIGMAS
     driven = uneven if shows else even
     still = driven.minus({NAME})
-    camera = certainty.compared(driven, still.plus("relaxation").plus("frame_offset").plus("agc"))
-    air = certainty.compared(driven, still.plus("attenuation", "varying"))
-    sure = all(one.db > MIN_DB and one.sigmas > MIN_SIGMAS for one in (camera, air))
-    return Known(certainty, shows, camera, sure)
+    camera, air = still.plus("frame_offset").plus("agc"), still.plus("attenuation", "varying")
+    gain = certainty.compared(driven, camera.plus("relaxation"))
+    sure = _clear(gain) and _clear(certainty.compared(driven, air))
+    relaxes = all(_clear(certainty.compared(one.plus("relaxation"), one)) for one in (camera, air))
+    return Known(certainty, shows, gain, sure, relaxes)
+
+
+def _clear(gain: HeldOut) -> bool:
+    return gain.db > MIN_DB and gain.sigmas > MIN_SIGMAS
 
 
 def harmonics(inspected: Inspection, count: int) -> int:
@@ -179,7 +193,7 @@ def frequencies(inspected: Inspection, count: int) -> Tensor:
     return frequency_grid(recorded, count, default_tau_min(recorded), math.sqrt(0.5))
 
 
-def _spans(inspected: Inspection) -> Tensor:
+def spans(inspected: Inspection) -> Tensor:
     """When images were taken, in spans of the record."""
     first, span = inspected.scene.record
     return (inspected.obs.times_s - first) / span

@@ -38,6 +38,14 @@ def response_table(rates: Tensor, moments: int) -> ResponseTable:
     return ResponseTable(knots, torch.eye(moments, dtype=torch.float64), rates.log())
 
 
+def response(course: Tensor, spans: Tensor, rates: Tensor) -> tuple[Tensor, Tensor]:
+    """What surfaces make of their start and of a source at spans [F]: decays and settled responses [F, R] of rates [R], float64
+    per span, to a course of power [K]."""
+    table = response_table(rates, len(course))
+    driven = torch.stack([table.exact(float(at)) @ course for at in spans])
+    return torch.exp(-spans[:, None] * rates), driven
+
+
 def common_course(
     values: Tensor,
     weights: Tensor,

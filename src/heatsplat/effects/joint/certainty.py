@@ -12,7 +12,8 @@ from torch import Tensor
 from heatsplat.effects.joint.courses import ANY, common_courses
 from heatsplat.effects.joint.data import MIN_FREE
 from heatsplat.effects.joint.fit import Fit
-from heatsplat.effects.joint.held_out import HeldOut, compared, shuffled, squares_of
+from heatsplat.effects.joint.foreseen import holds_still
+from heatsplat.effects.joint.held_out import HeldOut, compared, shows, shuffled, squares_of
 from heatsplat.effects.joint.least_squares import own_part
 from heatsplat.effects.joint.like_heat import may_be_heat
 from heatsplat.effects.joint.model import Model
@@ -22,7 +23,6 @@ from heatsplat.training.rng import generator_for
 
 # What an effect must bring on held-out observations: less is no loss, and within the scatter of the images it is chance.
 MIN_DB, MIN_SIGMAS = 0.3, 3.5
-NOTHING_DB, NOTHING_SIGMAS = 0.1, 1.0  # below either of which there is nothing
 SHUFFLES, NO_CHANCE = 8, 30.0  # gains from which it is not asked whether chance makes as much
 # Nine tenths of the points in the most even third are explained to within so many times the expected error: nothing is left
 # for another effect. At edges poses err.
@@ -51,11 +51,6 @@ class Worth:
 
     held_out: HeldOut
     doubt: str = ""
-
-
-def shows(gain: HeldOut) -> bool:
-    """Whether what is gained on held-out observations may be more than nothing."""
-    return gain.db > NOTHING_DB and gain.sigmas > NOTHING_SIGMAS
 
 
 class Certainty:
@@ -100,6 +95,10 @@ class Certainty:
         names = " and ".join(doubted)
         for name in self._instead_of(doubted):
             found.setdefault(name, f"it goes or comes with {names}, which nobody can tell from these images")
+        heat = {name for name in found if self.fit.data.effects[name].term.in_time}
+        followed = not heat & self.model.names and not any(self._lacking(name) for name in heat)
+        if heat and followed and self.fit.data.drivers is None and holds_still(self.fit, self.model, doubted):
+            found = {name: doubt for name, doubt in found.items() if name not in heat}
         return {name: doubt for name, doubt in found.items() if name not in self.sure}
 
     def idle(self, name: str, more: Model, less: Model) -> bool:

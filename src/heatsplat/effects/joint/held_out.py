@@ -15,6 +15,7 @@ from heatsplat.effects.joint.model import Model
 FOLDS = 4
 WORST = 25.0  # squares of the expected error that a missed observation counts at most
 NEGLIGIBLE = 1e-9
+NOTHING_DB, NOTHING_SIGMAS = 0.1, 1.0  # below either of which there is nothing
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,11 @@ def compared(more: Tensor, less: Tensor, weights: Tensor) -> HeldOut:
     error = float(each.std()) / math.sqrt(len(each)) + NEGLIGIBLE if len(each) > 1 else math.inf
     before, after = (max(float((used * one).sum()), NEGLIGIBLE) for one in (less, more))
     return HeldOut(10.0 * math.log10(before / after), float(each.mean()) / error, len(each))
+
+
+def shows(gain: HeldOut) -> bool:
+    """Whether what is gained on held-out observations may be more than nothing."""
+    return gain.db > NOTHING_DB and gain.sigmas > NOTHING_SIGMAS
 
 
 def shuffled(fit: Fit, less: Model, generator: torch.Generator, together: bool) -> Fit:

@@ -5,18 +5,24 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from heatsplat.effects import heat_source
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.least_squares import own_part
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.weathered import CHANCE, MIN_DB, NO_BALANCE
+from heatsplat.physics.common_course import least_squares, response
 
 NEIGHBOURS = 6
 MIN_POINTS, MIN_STRONG = 40, 25  # points, and those that differ clearly from their neighbours
+STRONG = 5.0  # times the noise by which these do
 # How much faster than levels contrasts must fade: bodies of one level but two rates look a little like it.
 FASTER = 1.35
 UNSURE = (0.5, 2.0)  # statistics between which sheets of two rates and weak flows are alike
+# Rates per span, between which contrasts and levels may answer a source, a factor of 1.1 apart.
+ANSWERS = torch.logspace(-1, 2, 73, dtype=torch.float64)
+STEADY = 1e-3  # ridge of the numbers with which points answer: noise in few frames passes for fast answers
 LEFT = 0.02  # levels that fade to less than this share are gone in the noise
 
 
@@ -24,7 +30,8 @@ def evidence(inspected: Inspection) -> Evidence:
     """Whether contrasts between neighbours fade faster than the levels that they share.
 
     Where every point relaxes by itself, an excess and a difference of two excesses fade alike. So they do where a camera's gain
-    drifts, which may pass for relaxation of all points, but not for a flow: that has courses of its own.
+    drifts, which may pass for relaxation of all points, but not for a flow: that has courses of its own. Where a source drives
+    the points they do not fade, but contrasts answer it as fast as levels do.
     """
     obs = inspected.obs
     if inspected.joint is None or obs.times_s is None:
@@ -34,7 +41,7 @@ def evidence(inspected: Inspection) -> Evidence:
         return _in_weather(inspected)
     if "relaxation" not in model.names or "harmonic_source" in model.names:
         if "harmonic_source" in model.names:
-            return Evidence(None, "cannot be told: a source hides how contrasts fade", told=False)
+            return _driven(inspected)
         doubt = inspected.certainty.doubts.get("relaxation") or inspected.certainty.few("relaxation")
         if doubt and "relaxation" not in model.names and inspected.certainty.changes:
             return Evidence(None, f"cannot be told, as whether anything changes over time: {doubt}", told=False)
@@ -44,12 +51,12 @@ def evidence(inspected: Inspection) -> Evidence:
     if len(points) < MIN_POINTS:
         why = f"cannot be told: {len(points)} points are too few to have neighbours, {MIN_POINTS} are needed"
         return Evidence(None, why, told=False)
-    near = torch.cdist(points, points).topk(NEIGHBOURS + 1, largest=False).indices[:, 1:]
+    near = _neighbours(points)
     first, last = early[used], late[used]
     before, after = first[near].mean(1), last[near].mean(1)
     kept = _kept_apart(before, after) if "frame_offset" in model.names else _kept(before, after, obs.ambient)
     contrast, remains = first - before, last - after
-    strong = contrast.abs() > 5.0 * obs.noise
+    strong = contrast.abs() > STRONG * obs.noise
     if int(strong.sum()) < MIN_STRONG or kept < LEFT:
         why = "neighbours are too much alike, or all is cold in the end; a shorter record of finer patterns would tell"
         return Evidence(None, f"cannot be told: {why}", told=False)
@@ -60,6 +67,51 @@ def evidence(inspected: Inspection) -> Evidence:
     if UNSURE[0] < statistic < UNSURE[1]:
         return Evidence(statistic, f"{found}: cannot be told, bodies of two rates would do that as well", told=False)
     return Evidence(statistic, found)
+
+
+def _driven(inspected: Inspection) -> Evidence:
+    """Whether contrasts between neighbours answer a source as fast as the levels that they share.
+
+    A flow adds to the rate at which they do. Bodies of two rates would as well, so that it is never found beside a source.
+    """
+    hidden = Evidence(None, "cannot be told: a source hides how contrasts fade", told=False)
+    source = inspected.heat_source
+    seen = None if source is None or not source.common else heat_source.answering(inspected)
+    if seen is None:
+        return hidden
+    values, weights, points = seen
+    if len(points) < MIN_POINTS:
+        return hidden
+    spans = heat_source.spans(inspected)
+    basis = torch.cat(response(source.course, spans, heat_source.RATES_OF_POINTS), 1)
+    clean = least_squares(values, weights, basis, STEADY)[0] @ basis.T
+    levels = clean[_neighbours(points)].mean(1)
+    contrasts = clean - levels
+    strong = contrasts.std(1) > STRONG * inspected.obs.noise
+    if int(strong.sum()) < MIN_STRONG:
+        return hidden
+    slow, fast = (_rate(source.course, spans, one[strong]) for one in (levels, contrasts))
+    statistic = (fast / slow - 1.0) / (FASTER - 1.0)
+    found = f"contrasts between neighbours answer the source at {fast / slow:.2f} times the rate of the levels that they share"
+    if statistic > UNSURE[0]:
+        return Evidence(None, f"{found}: cannot be told, bodies of two rates would do that as well", told=False)
+    return Evidence(max(statistic, 0.0), found)
+
+
+def _rate(course: Tensor, spans: Tensor, values: Tensor) -> float:
+    """The rate per span at which values [P, F] answer a course of power [K] (``physics.common_course``); each counts alike."""
+    decays, driven = response(course, spans, ANSWERS)
+    values, ones = values / values.norm(dim=1, keepdim=True), torch.ones_like(values)
+    explained = [
+        least_squares(values, ones, torch.stack([decays[:, rate], driven[:, rate]], 1))[1].sum()
+        for rate in range(len(ANSWERS))
+    ]
+    return float(ANSWERS[torch.stack(explained).argmax()])
+
+
+def _neighbours(points: Tensor) -> Tensor:
+    """Which points [P, NEIGHBOURS] are nearest to points [P, 3]."""
+    return torch.cdist(points, points).topk(NEIGHBOURS + 1, largest=False).indices[:, 1:]
 
 
 def _in_weather(inspected: Inspection) -> Evidence:

@@ -9,11 +9,12 @@ from torch import Tensor
 
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.joint.certainty import Certainty, shows
+from heatsplat.effects.joint.certainty import Certainty
 from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
+from heatsplat.effects.joint.held_out import shows
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.selection import worthwhile
 from heatsplat.effects.joint.terms import SHARED_HURDLE, Shared

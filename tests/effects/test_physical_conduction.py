@@ -1,0 +1,68 @@
+"""Heat that flows between neighbours beside a source: contrasts answer it faster than levels do."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch.nn import functional
+
+from heatsplat.effects.heat_source import Source
+from heatsplat.effects.joint.fit import fit_of
+from heatsplat.effects.joint.model import Model
+from heatsplat.effects.physical.conduction import NEIGHBOURS, evidence
+from tests.effects.tracks import FRAMES, NOISE, PASSED, POINTS, TIMES_S, data_of, drawn
+
+RATE, MOMENTS, STEPS = 6.0, 61, 4000
+COURSE = ((4.0 * torch.linspace(0, 1, MOMENTS, dtype=torch.float64)) % 2 < 1).double()
+DRIVEN = Model.of(relaxation=1, harmonic_source=1)
+
+
+def lit(flow: float, rates: torch.Tensor) -> torch.Tensor:
+    """Excess [P, F] of points at rates [P, 1] per span under a lamp, strong or weak there, with a flow between them."""
+    points = drawn(POINTS, 3, seed=4)
+    near = torch.cdist(points, points).topk(NEIGHBOURS + 1, largest=False).indices[:, 1:]
+    strength, excess = 4.0 * drawn(POINTS, 1, seed=6).exp(), torch.zeros(POINTS, 1, dtype=torch.float64)
+    found = [excess]
+    for power in functional.interpolate(COURSE[None, None], size=STEPS, mode="linear", align_corners=True).flatten():
+        change = strength * power - rates * excess + flow * (excess[near].mean(1) - excess)
+        excess = excess + change / STEPS
+        found.append(excess)
+    return torch.cat(found, 1)[:, (PASSED * STEPS).round().long()]
+
+
+def seen(values: torch.Tensor, source: Source | None) -> SimpleNamespace:
+    fit = fit_of(replace(data_of(values), ambient=0.0))
+    tracks = fit.data.tracks
+    return SimpleNamespace(
+        joint=(fit, DRIVEN),
+        obs=SimpleNamespace(times_s=TIMES_S, noise=NOISE, tracks=tracks, ambient=0.0, why=""),
+        scene=SimpleNamespace(record=(0.0, float(TIMES_S[-1]))),
+        heat_source=source,
+    )
+
+
+KNOWN = Source(1, COURSE, 1.0, 2.0)
+ALIKE = torch.full((POINTS, 1), RATE, dtype=torch.float64)
+
+
+def test_points_that_answer_a_source_by_themselves_do_so_as_fast_as_they_differ_from_their_neighbours():
+    found = evidence(seen(lit(0.0, ALIKE), KNOWN))
+    assert found.told and found.statistic < 0.5
+
+
+@pytest.mark.parametrize("flow", [RATE / 2, RATE, 3 * RATE])
+def test_a_flow_beside_a_source_is_not_ruled_out(flow):
+    found = evidence(seen(lit(flow, ALIKE), KNOWN))
+    assert not found.told and "times the rate" in found.reason
+
+
+@pytest.mark.parametrize("source", [None, Source(1), Source(1, COURSE, 2.0, 1.0)])
+def test_a_source_whose_course_nobody_knows_hides_a_flow(source):
+    found = evidence(seen(lit(0.0, ALIKE), source))
+    assert not found.told and "hides how contrasts fade" in found.reason
+
+
+def test_contrasts_that_few_neighbours_show_tell_nothing():
+    values = lit(0.0, ALIKE).mean(0, keepdim=True).expand(POINTS, FRAMES)
+    assert not evidence(seen(values, KNOWN)).told
