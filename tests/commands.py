@@ -147,6 +147,7 @@ def _as_a_shell_does(script: str, cwd: str, variables: dict[str, str]) -> None:
     os.environ.update(variables)
     gc.freeze()  # what the server loaded is not looked through again
     if Path(script).resolve().parent != SOURCES:
+        sys.modules["loaded_libraries"].COMPOSING.close()
         for name in [name for name in sys.modules if name.partition(".")[0] in OURS]:
             del sys.modules[name]
     elif FILMS in variables:
