@@ -24,6 +24,7 @@ from unittest import mock
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ROOT / "src"
 OURS = ("heatsplat", "hydra_plugins")
+FILMS = "HEATSPLAT_TESTS_FILMS"  # a folder of recordings that commands share with the tests
 LIBRARIES = (
     "loaded_libraries",
     "torch", "pytorch_lightning", "torchmetrics", "torch.utils.tensorboard", "kornia", "numba", "cv2", "skimage.metrics",
@@ -146,8 +147,15 @@ def _as_a_shell_does(script: str, cwd: str, variables: dict[str, str]) -> None:
     os.environ.update(variables)
     gc.freeze()  # what the server loaded is not looked through again
     if Path(script).resolve().parent != SOURCES:
+        sys.modules["loaded_libraries"].COMPOSING.close()
         for name in [name for name in sys.modules if name.partition(".")[0] in OURS]:
             del sys.modules[name]
+    elif FILMS in variables:
+        from running import recording_once
+
+        from heatsplat.datamodules import synthetic
+
+        synthetic.film = recording_once(synthetic.film, Path(variables[FILMS]))
 
 
 def _print_to(path: str) -> None:

@@ -10,8 +10,10 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
+from _pytest.logging import catching_logs
+from commands import FILMS
 from quick_compositions import quick_compositions
-from running import filming_once
+from running import filming_once, recording_once
 
 from heatsplat.training.machine import cores, loading, prepare_machine
 
@@ -108,18 +110,57 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: place.get("/".join(item.path.parts[-2:]), len(LONGEST)))
 
 
+class Loggers:
+    """Levels and the like of the hundreds of loggers. To look at all takes as long as a short test, and pytest would do so six
+    times for each, for those of which the root does not hear: they are looked up once."""
+
+    def __init__(self) -> None:
+        self.known: tuple | None = None  # settings that hold unless a wider fixture was made or undone since
+        self.apart: list[logging.Logger] = []  # of which the root does not hear
+
+    def settings(self) -> tuple[int, int, dict[str, tuple[int, bool, bool]]]:
+        root, found = logging.root, logging.root.manager.loggerDict
+        loggers = [(name, one) for name, one in found.items() if isinstance(one, logging.Logger)]
+        self.apart = [one for _, one in loggers if not one.propagate]
+        each = {name: (one.level, one.disabled, one.propagate) for name, one in loggers}
+        self.known = root.level, root.manager.disable, each
+        return self.known
+
+    def catch(self, caught: catching_logs) -> logging.Handler:
+        """In place of ``caught.__enter__``."""
+        if caught.level is not None:
+            caught.handler.setLevel(caught.level)
+            caught.orig_level = logging.root.level
+            logging.root.setLevel(min(caught.orig_level, caught.level))
+        for one in (logging.root, *self.apart):
+            one.addHandler(caught.handler)
+            caught.attached_loggers.append(one)
+        return caught.handler
+
+
+LOGGERS = Loggers()
+if "attached_loggers" in getattr(catching_logs, "__slots__", ()):  # as in the pytest that this was written for
+    catching_logs.__enter__ = lambda caught: LOGGERS.catch(caught)
+
+
+def pytest_fixture_setup(fixturedef):
+    if fixturedef.scope != "function":
+        LOGGERS.known = None
+
+
+def pytest_fixture_post_finalizer(fixturedef):
+    if fixturedef.scope != "function":
+        LOGGERS.known = None
+
+
 @pytest.fixture(autouse=True)
 def logging_as_it_was():
     """A command that runs in the test process sets logging up for itself; the next test starts from what was there."""
-    root, found = logging.getLogger(), logging.root.manager.loggerDict
-
-    def settings():
-        each = {name: (one.level, one.disabled, one.propagate) for name, one in found.items() if hasattr(one, "level")}
-        return root.level, root.manager.disable, each
-
-    (level, muted, before), names = settings(), set(found)
+    root, found = logging.root, logging.root.manager.loggerDict
+    level, muted, before = LOGGERS.known or LOGGERS.settings()
+    names = set(found)
     yield
-    if settings() == (level, muted, before):
+    if LOGGERS.settings() == (level, muted, before):
         return
     root.setLevel(level)
     logging.disable(muted)
@@ -127,6 +168,7 @@ def logging_as_it_was():
         if hasattr(one, "level") and (name in before or name not in names):
             one.level, one.disabled, one.propagate = before.get(name, (logging.NOTSET, False, True))
     root.manager._clear_cache()
+    LOGGERS.settings()
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -147,8 +189,10 @@ def films(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module", autouse=True)
 def filmed_once(films):
     """Scenes of the same recording share it: filming takes half of a tiny run. Tests of filming itself call ``film``."""
-    from heatsplat.datamodules.synthetic import Synthetic
+    from heatsplat.datamodules import synthetic
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Synthetic, "load", filming_once(Synthetic.load, films))
+        patch.setattr(synthetic, "film", recording_once(synthetic.film, films))
+        patch.setattr(synthetic.Synthetic, "load", filming_once(synthetic.Synthetic.load, films))
+        patch.setenv(FILMS, str(films))
         yield

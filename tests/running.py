@@ -51,6 +51,25 @@ def filming_once(film: Callable, films: Path) -> Callable:
     return load
 
 
+def recording_once(film: Callable, films: Path) -> Callable:
+    """``film`` for scenes that differ in how a recording is stored, shared out or read: it is filmed once by all processes that
+    share the folder ``films``. Each who asks has arrays of its own."""
+
+    def filmed(scene, size, seed=0, noise_k=0.05, distortion=(), pixel_aspect=1.0):
+        from heatsplat.datamodules.synthetic_scene.film import Recording
+
+        asked = (size, seed, noise_k, tuple(distortion), pixel_aspect)
+        if "route" in vars(scene):  # of its own, which its preset does not tell
+            return film(scene, *asked)
+        settings = repr((type(scene).__qualname__, scene.preset, asked))
+        file = films / f"film_{hashlib.sha256(settings.encode()).hexdigest()}"
+        if not file.exists():
+            write_atomically(file, pickle.dumps({**vars(film(scene, *asked)), "scene": None}))
+        return Recording(**{**pickle.loads(file.read_bytes()), "scene": scene})
+
+    return filmed
+
+
 def run(output_dir: Path, *overrides: str):
     """(module, trainer) after a run with these overrides; tests its views too unless test=false is among them."""
     from heatsplat.runs.run import begin

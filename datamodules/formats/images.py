@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -18,6 +19,8 @@ from heatsplat.datamodules.formats.lens import Lens, undistortion_maps
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+
+PNG = b"\x89PNG\r\n\x1a\n"  # begins one; size and type follow, and their checksum
 
 # Kind of a page of a TIFF (1: a smaller copy, 4: a mask), its width, height, bits of a sample, samples of a pixel, their type.
 PAGE_TAGS = (254, 256, 257, 258, 277, 339)
@@ -65,6 +68,8 @@ def _only(path: Path) -> np.ndarray | None:
         raise SceneError(f"image {path} is empty (0 bytes); copy it again or remove it from the scene")
     if data[:2] == b"\xff\xd8" and _is_truncated_jpeg(data):
         raise SceneError(f"image {path} is corrupt: the JPEG ends early; copy it again or remove it from the scene")
+    if data[:8] == PNG and data[29:33] != struct.pack(">I", zlib.crc32(data[12:29])):  # OpenCV seeks pixels for seconds
+        return None
     if (count := len(pages_of(path))) > 1:
         raise SceneError(
             f"image {path} is a TIFF of {count} images, and one is expected; write each into a file of its own, or prepare the "

@@ -116,9 +116,14 @@ def test_it_is_held_and_its_pane_has_a_pattern():
 # One opacity or two ---------------------------------------------------------------------------------
 
 
+@cache
+def trained_on() -> Recording:
+    return film(Scene(PRESETS["glass"]), SIZES["tiny"])
+
+
 def in_the_pane(module) -> dict[str, float]:
     """Mean PSNR of heat and colour over the pane's pixels of the test views, in dB."""
-    recording, scores = film(Scene(PRESETS["glass"]), SIZES["tiny"]), {"thermal": [], "rgb": []}
+    recording, scores = trained_on(), {"thermal": [], "rgb": []}
     for view in module.scene.test:
         pane = torch.from_numpy(recording.shows(view.frame.frame_id, "pane"))
         assert view.frame.name == f"frame_{view.frame.frame_id:05d}.png"

@@ -80,6 +80,19 @@ def test_damaged_images_are_named(tmp_path, suffix):
         read_image(path)
 
 
+@pytest.mark.parametrize("place", [19, 24, 25, 28, 32])
+def test_a_png_whose_header_is_damaged_is_refused_before_its_pixels_are_sought(tmp_path, monkeypatch, place):
+    """Size, type or their checksum: decoding would take seconds and gigabytes to find out."""
+    data = bytearray(cv2.imencode(".png", np.zeros((20, 24), np.uint16))[1])
+    (tmp_path / "whole.png").write_bytes(data)
+    data[place] ^= 1
+    (tmp_path / "damaged.png").write_bytes(data)
+    assert read_image(tmp_path / "whole.png").shape == (20, 24)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    with pytest.raises(SceneError, match=r"damaged\.png is corrupt or no image"):
+        read_image(tmp_path / "damaged.png")
+
+
 def test_a_whole_jpeg_is_not_called_truncated(tmp_path):
     path = tmp_path / "a.jpg"
     write_image(path, np.full((40, 40), 99, np.uint8))

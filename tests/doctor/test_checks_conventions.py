@@ -9,6 +9,7 @@ from materials import clean, findings_of
 
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.doctor.base import material_of
+from heatsplat.doctor.checks import conventions
 from heatsplat.doctor.checks.conventions import READINGS
 from heatsplat.doctor.examination import examine
 from heatsplat.geometry.transforms import OPENGL_AXES
@@ -70,6 +71,20 @@ def test_poses_that_are_read_as_they_were_written_raise_no_alarm(scene, written)
     material = misread(clean(scene), written, written)
     assert findings_of(material, "conventions") == []
     assert findings_of(replace(material, points=None), "conventions") == []
+
+
+def test_other_readings_are_tried_where_one_could_fit_enough_better_alone(monkeypatch):
+    asked, fits = [], conventions._fits
+
+    def told(material):
+        fitted = fits(material)
+        return lambda name: asked.append(name) or fitted(name)
+
+    monkeypatch.setattr(conventions, "_fits", told)
+    assert findings_of(clean(), "conventions") == []
+    assert asked == [MODEL, conventions.UNMOVED]
+    assert len(findings_of(misread(clean(), OPENCV, JSON), "conventions")) == 1
+    assert asked[2:4] == [JSON, conventions.UNMOVED] and {*asked[4:]} == {*READINGS} - {JSON}
 
 
 def test_points_tell_where_images_show_nothing():

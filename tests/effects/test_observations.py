@@ -70,8 +70,9 @@ def test_images_of_nothing_have_no_effects():
 
 
 @pytest.mark.parametrize(("look", "frames"), [(observe, 64), (material_of, 32), (_votes, 64), (swept_points, 64)])
-def test_views_are_decoded_once_and_one_after_the_other(look, frames):
+def test_views_are_decoded_once_and_one_after_the_other(look, frames, monkeypatch):
     """What is held of photos, the largest part of a view, does not grow with the number of views."""
+    monkeypatch.setattr("heatsplat.effects.swept_points.REFERENCES", 1)  # views that are swept, once all are decoded
     scene, photos, held = flight(80), [], []
 
     def decode(i: int) -> View:

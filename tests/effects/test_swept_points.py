@@ -43,6 +43,7 @@ def test_points_lie_on_surfaces_of_a_scene_that_cools_meanwhile(swept):
 def test_pixels_that_no_block_of_the_smaller_images_holds_move_no_point(monkeypatch):
     """Images of 239 pixels become 23 of ten each; the rest is left out, and what is left lies where it did."""
     monkeypatch.setattr(module, "WIDEST", 25)
+    monkeypatch.setattr(module, "REFERENCES", 2)
     K = torch.tensor([[200.0, 0.0, 119.5], [0.0, 200.0, 99.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
     y, x = torch.meshgrid(torch.arange(199) + 0.5, torch.arange(239) + 0.5, indexing="ij")
     views = []

@@ -11,6 +11,7 @@ from running import NO_PICTURES
 from test_checkpoint_files import disk_of
 
 from heatsplat import composition
+from heatsplat.callbacks import report
 from heatsplat.contracts import SceneError
 from heatsplat.runs import lock, run
 from heatsplat.runs.signals import stoppable
@@ -35,6 +36,14 @@ class KillAfter(pl.Callback):
     def on_train_batch_end(self, trainer, *_):
         if trainer.global_step == self.step:
             raise Killed
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_curves():
+    """Nobody looks at the picture, which takes half of such a run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "draw_curves", lambda folder: None)
+        yield
 
 
 @pytest.fixture(scope="module")

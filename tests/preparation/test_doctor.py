@@ -1,5 +1,6 @@
 """The doctor on folders: a scene that trains, and a camera's files."""
 
+import functools
 import json
 import shutil
 from dataclasses import replace
@@ -16,7 +17,7 @@ from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene import writers
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, write_camera
-from heatsplat.datamodules.synthetic_scene.film import SIZES, Size, film
+from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.datamodules.synthetic_scene.writers import write_colmap
@@ -29,8 +30,14 @@ from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.prepare import prepare
 
 
+@functools.cache
+def still(size: Size = SIZES["tiny"]) -> Recording:
+    """A recording that several tests write as files, and nobody changes."""
+    return film(Scene(PRESETS["static"]), size)
+
+
 def test_a_clean_scene_has_no_findings_and_the_file_says_so(tmp_path):
-    write_colmap(film(Scene(PRESETS["static"]), SIZES["tiny"]), tmp_path / "scene")
+    write_colmap(still(), tmp_path / "scene")
     assert check(str(tmp_path / "scene"), tmp_path) == []
     assert json.loads((tmp_path / "doctor.json").read_text()) == []
 
@@ -47,7 +54,7 @@ def test_a_clean_scene_has_no_findings_and_the_file_says_so(tmp_path):
     ],
 )
 def test_scenes_of_every_layout_are_read_as_their_loaders_read_them(tmp_path, caplog, layout, told):
-    getattr(writers, f"write_{layout}")(film(Scene(PRESETS["static"]), SIZES["tiny"]), tmp_path / "scene")
+    getattr(writers, f"write_{layout}")(still(), tmp_path / "scene")
     with caplog.at_level("INFO"):
         assert check(str(tmp_path / "scene"), tmp_path) == []
     name = "nerfstudio" if layout == "thermoscenes" else layout  # whose layout it is
@@ -55,7 +62,7 @@ def test_scenes_of_every_layout_are_read_as_their_loaders_read_them(tmp_path, ca
 
 
 def test_what_is_said_of_a_camera_s_files_is_refused_for_a_scene(tmp_path):
-    write_colmap(film(Scene(PRESETS["static"]), SIZES["tiny"]), tmp_path / "scene")
+    write_colmap(still(), tmp_path / "scene")
     with pytest.raises(SceneError, match="bounds_c changes nothing for the scene in .*: it is for a camera's files"):
         check(str(tmp_path / "scene"), tmp_path, bounds_c=[0, 50])
     with pytest.raises(SceneError, match="counts.scale changes nothing"):
@@ -63,14 +70,14 @@ def test_what_is_said_of_a_camera_s_files_is_refused_for_a_scene(tmp_path):
 
 
 def test_dead_pixels_and_a_late_clock_are_found_in_a_camera_s_files(tmp_path):
-    recording = film(Scene(PRESETS["static"]), Size(64, 52, 8, 60))
+    recording = still(Size(64, 52, 8, 60))
     write_camera(recording, tmp_path / "camera", Field(dead_pixels=5, rgb=True, rgb_clock_s=400.0))
     said = section(tmp_path / "camera")
     assert {"dead_pixels", "pairing"} <= {one["check"] for one in said.values["findings"]}
 
 
 def test_a_look_at_files_says_what_it_could_not_look_at(tmp_path, caplog):
-    recording = film(Scene(PRESETS["static"]), Size(64, 52, 8, 60))
+    recording = still(Size(64, 52, 8, 60))
     write_camera(recording, tmp_path / "camera")
     write_colmap(recording, tmp_path / "scene")
     for folder, told in (("camera", True), ("scene", False)):
@@ -83,7 +90,7 @@ def test_a_look_at_files_says_what_it_could_not_look_at(tmp_path, caplog):
 
 
 def test_greys_that_the_camera_stretched_are_found_in_its_files_before_they_are_prepared(tmp_path):
-    recording = film(Scene(PRESETS["static"]), Size(64, 52, 8, 60))
+    recording = still(Size(64, 52, 8, 60))
     low, high = float(recording.celsius.min()), float(recording.celsius.max())
     for name in ("stretched", "linear"):
         (tmp_path / name).mkdir()
@@ -96,8 +103,9 @@ def test_greys_that_the_camera_stretched_are_found_in_its_files_before_they_are_
     assert said["stretched"][0]["check"] == "agc" and said["linear"] == []
 
 
+@pytest.mark.usefixtures("dots_for_pictures")
 def test_kelvin_in_a_scene_is_told_and_what_is_said_of_it_helps(tmp_path):
-    recording = film(Scene(PRESETS["static"]), Size(64, 52, 8, 60))
+    recording = still(Size(64, 52, 8, 60))
     for name, kelvin in (("floats", 1.0), ("counts", 100.0)):
         write_colmap(recording, tmp_path / name)
         (tmp_path / name / "temperature_bounds.json").unlink()
@@ -132,7 +140,7 @@ def test_kelvin_in_a_scene_is_told_and_what_is_said_of_it_helps(tmp_path):
 
 
 def test_clocks_of_which_one_says_no_zone_may_be_hours_apart(tmp_path):
-    recording = film(Scene(PRESETS["static"]), Size(64, 52, 8, 60))
+    recording = still(Size(64, 52, 8, 60))
     write_camera(recording, tmp_path / "camera", Field(rgb=True))
     frames = read_frames(tmp_path / "camera")
 

@@ -35,6 +35,7 @@ ALLOWED = {
         "metrics",
         "physics",
         "io",
+        "kernels",
         "heatsplat",
         "shots",
         "uncertainty",

@@ -30,8 +30,9 @@ def drawn(backend: str, maps: int, as_function: bool = True, background: torch.T
     leaves = [tensor.clone().requires_grad_() for tensor in (means, quats, scales, opacities, values)]
     emitted = (lambda ids: leaves[4].index_select(0, ids)) if as_function else leaves[4]
     output = rasterization(
-        *leaves[:4], emitted, viewmat, K, WIDTH, HEIGHT, backend=backend, depth=False, maps=maps, background=background
-    )
+        *leaves[:4], emitted, viewmat, K, WIDTH, HEIGHT,
+        backend=backend, depth=False, maps=maps, absgrad=maps > 0, background=background,
+    )  # fmt: skip
     return output, leaves
 
 

@@ -152,10 +152,9 @@ def test_shadows_of_a_sun_that_never_rises_change_nothing(solution):
     night = scene(replace(record, sun=low, irradiance_w_m2=none, direct_w_m2=none, diffuse_w_m2=none))
     model, splats = ready(night, solution=solution, shadows=True, albedo=0.3)
     plain, open_splats = ready(night, solution=solution)
-    with torch.no_grad():
-        torch.testing.assert_close(
-            model.temperature(splats, 12 * HOUR), plain.temperature(open_splats, 12 * HOUR), atol=1e-4, rtol=0
-        )
+    torch.testing.assert_close(
+        model.temperature(splats, 12 * HOUR), plain.temperature(open_splats, 12 * HOUR), atol=1e-4, rtol=0
+    )
 
 
 def test_effects_that_are_off_or_unknown_are_absent():

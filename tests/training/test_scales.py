@@ -121,7 +121,7 @@ def test_a_run_without_sunlight_says_what_to_do_under_a_record_that_has_gained_i
 
     with monkeypatch.context() as filming:
         filming.setattr(Synthetic, "load", dark)
-        _, trainer = run(tmp_path, *BARE, "method=energy_balance", "max_steps=3")
+        _, trainer = run(tmp_path, *BARE, "method=energy_balance", "max_steps=3", "trainer.max_steps=0")
         trainer.save_checkpoint(tmp_path / "dark.ckpt")
     with pytest.raises(
         SceneError, match=r"lacks normals, raw_sun: .*has gained or lost its irradiance since\. .*taken out again"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,13 @@ TARGET = re.compile(r"""_target_:\s*["']?([\w.]+)""")
 
 def vocabulary() -> set[str]:
     """The ``_target_`` that may stand in a checkpoint, fully dotted. Nothing is imported to find them."""
+    return _own() | {entry.value.replace(":", ".") for entry in entry_points(group=ENTRY_POINTS)}
+
+
+@cache  # some two hundred files
+def _own() -> frozenset[str]:
     files = (path for path in Path(CONF).rglob("*.yaml") if path.relative_to(CONF).parts[0] not in COMMANDS)
-    own = {target for path in files for target in TARGET.findall(path.read_text(encoding="utf-8"))}
-    return own | {entry.value.replace(":", ".") for entry in entry_points(group=ENTRY_POINTS)}
+    return frozenset(target for path in files for target in TARGET.findall(path.read_text(encoding="utf-8")))
 
 
 def trusted(config: Any, path: Path | str, trust: Collection[str] = ()) -> dict[str, Any]:

@@ -31,6 +31,8 @@ NOISE = (
     r".*`lr_scheduler.step\(\)` before.*",
 )
 
+_loaded = False  # libraries were, in this process, or are being
+
 
 def cores() -> int:
     """CPU cores that this process may use: on a cluster those of the job, not those of the node."""
@@ -80,9 +82,11 @@ def loading() -> Iterator[None]:
     There is none among libraries, and the search takes a third of the time in which a command loads them. Later it would
     keep what jobs of a sweep have left behind. Lightning is loaded first, without what no command uses (``_stand_ins``).
     """
-    if gc.get_freeze_count():
+    global _loaded
+    if _loaded:  # gc.get_freeze_count knows too, and counts half a million objects for it, which takes 0.1 s
         yield
         return
+    _loaded = True
     gc.disable()
     try:
         with _stand_ins():

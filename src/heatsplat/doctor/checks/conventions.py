@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -22,6 +23,8 @@ OVERLAP = 0.25  # share of an image that has to be in the other one
 # Correlation that another reading has to gain, in most pairs; where one is misread it is 0.2 to 0.9 in the median.
 MOST, BETTER = 0.75, 0.1
 GAINED = 0.25  # of what another reading gains over images that did not move, a misread one gains less; often it loses
+ALIKE = 1.001  # more than any correlation, with its rounding
+UNMOVED = "unmoved"  # beside the readings: images that lie on each other as they are
 CAMERAS, SOME = 32, 2000  # that are asked what they see, and points
 NONE_SEEN, SEEN = 0.1, 0.5  # shares of points in view of a misread and of a right reading
 BLIND, SEEING = 0.5, 0.9  # the same for the share of cameras that see any
@@ -41,13 +44,18 @@ def find(material: Material) -> list[Finding]:
     if cameras is None or len(cameras) < MIN_PAIRS:
         return []
     given = material.poses_are
-    fits = _fits(material)
-    if fits is not None:
-        other = _fitting(fits, given)
+    fitted = _fits(material)
+    if fitted is not None:
+        fits = {name: fitted(name) for name in (given, UNMOVED)}
+        own, most = fits[given] - fits[UNMOVED], ALIKE - fits[UNMOVED]
+        other = None
+        if float(own.median()) < GAINED * float(most.median()):  # of more than that, no reading gains enough
+            fits |= {name: fitted(name) for name in READINGS if name != given}
+            other = _fitting(fits, given)
         if other is not None:
             apart = f"{float(fits[other].median()):.2f} instead of {float(fits[given].median()):.2f}"
             return [_told(material, other, f"neighbouring images laid on each other correlate to {apart}")]
-        if float((fits[given] - fits["unmoved"]).median()) > BETTER:
+        if float(own.median()) > BETTER:
             return []
     seen = _seen(material)
     other = max(seen, key=lambda one: seen[one][0])
@@ -101,13 +109,13 @@ def _views_of(material: Material, cameras: list[Camera]) -> dict[str, list[Camer
 def _fitting(fits: dict[str, Tensor], given: str) -> str | None:
     """Another reading under which images fit each other, where they do not under the given one."""
     best = max((name for name in READINGS if name != given), key=lambda name: float(fits[name].median()))
-    gain, own = fits[best] - fits["unmoved"], fits[given] - fits["unmoved"]
+    gain, own = fits[best] - fits[UNMOVED], fits[given] - fits[UNMOVED]
     better = float(((gain > 0) & (gain - own > BETTER)).double().mean())
     return best if better >= MOST and float(own.median()) < GAINED * float(gain.median()) else None
 
 
-def _fits(material: Material) -> dict[str, Tensor] | None:
-    """How well images fit each other [pairs] under every reading, and ``unmoved``; None of too few."""
+def _fits(material: Material) -> Callable[[str], Tensor] | None:
+    """How well images fit each other [pairs] under a reading, or UNMOVED; None of too few."""
     pairs = _pairs(material)
     if len(pairs) < MIN_PAIRS:
         return None
@@ -119,14 +127,14 @@ def _fits(material: Material) -> dict[str, Tensor] | None:
         scale = camera.K.new_tensor([width / camera.width, height / camera.height, 1.0])
         lenses[frame] = scale[:, None] * camera.K
     views = {name: [camera.viewmat for camera in read] for name, read in _views_of(material, material.cameras).items()}
-    views["unmoved"] = [torch.eye(4, dtype=torch.float64)] * len(material.cameras)
-    return {
-        name: torch.tensor(
-            [_fit(small[i], small[j], lenses[i], lenses[j], viewmats[i], viewmats[j]) for i, j in pairs],
-            dtype=torch.float64,
-        )
-        for name, viewmats in views.items()
-    }
+    views[UNMOVED] = [torch.eye(4, dtype=torch.float64)] * len(material.cameras)
+
+    def fitted(name: str) -> Tensor:
+        view = views[name]
+        found = [_fit(small[i], small[j], lenses[i], lenses[j], view[i], view[j]) for i, j in pairs]
+        return torch.tensor(found, dtype=torch.float64)
+
+    return fitted
 
 
 def _pairs(material: Material) -> list[tuple[int, int]]:
