@@ -16,6 +16,9 @@ from heatsplat.training.machine import prepare_machine
 
 pytestmark = pytest.mark.slow  # until every method has passed on an idle machine; 60 runs of about a second
 
+NOTHING_LEFT = (
+    1e-3  # error of images with which a scene may begin as it ends: points of one value tell an even one at once
+)
 CAUSE = (FloatingPointError, SceneError, RuntimeError)
 
 
@@ -78,13 +81,11 @@ def one_gaussian(plain: dict[str, Any]) -> dict[str, Any]:
 
 def hundredfold(plain: dict[str, Any]) -> dict[str, Any]:
     def faster(key, number):
-        return number * 100 if key.startswith("lr") and not key.endswith("_end") else number
-
-    def all_faster(key, number):
-        return number if key in ("means_end", "decay", "eps") else number * 100
+        return number * 100 if key.startswith("lr") and not key.endswith(("_end", "_held")) else number
 
     module = everywhere(plain["module"], faster)
-    return plain | {"module": module | {"optim": everywhere(module["optim"], all_faster)}}
+    rates = {name: 100 * module["optim"][name] for name in ("means", "log_scales", "quats", "opacity_logits")}
+    return plain | {"module": module | {"optim": module["optim"] | rates}}
 
 
 def resets(plain: dict[str, Any]) -> dict[str, Any]:
@@ -137,7 +138,7 @@ def test_a_run_learns_or_says_what_is_wrong(method, name, tmp_path):
         assert all(bool(p.isfinite().all()) for p in module.parameters())
         assert all(bool(module.predict(frame).isfinite().all()) for frame in module.scene.train.frames)
         if case.learns is not None:
-            assert shown.after < case.learns * shown.before
+            assert shown.after < max(case.learns * shown.before, NOTHING_LEFT)
         assert "last.ckpt" in checkpoints(tmp_path)
     for file, tensors in checkpoints(tmp_path).items():
         assert [key for key, value in tensors.items() if not value.isfinite().all()] == [], file
