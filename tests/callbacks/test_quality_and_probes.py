@@ -44,7 +44,7 @@ def test_temperature_errors_that_cannot_be_had_say_why(tmp_path, scene, reason):
 @pytest.mark.parametrize(
     ("net", "weights", "message"),
     [
-        ("squeeze", None, "callbacks.metrics.lpips_net must be one of alex, vgg, None, got 'squeeze'"),
+        ("squeeze", None, "callbacks.metrics.lpips_net must be one of alex, vgg, null, got 'squeeze'"),
         ("alex", "no.pth", "lpips_weights=no.pth: .*not at no.pth"),
         ("alex", "text.pth", "lpips_weights=.*text.pth cannot be read as weights"),
         ("vgg", "other.pth", "lpips_weights=.*other.pth: .* not those of the net"),
