@@ -16,9 +16,8 @@ from heatsplat.training.machine import prepare_machine
 
 pytestmark = pytest.mark.slow  # until every method has passed on an idle machine; 60 runs of about a second
 
-NOTHING_LEFT = (
-    1e-3  # error of images with which a scene may begin as it ends: points of one value tell an even one at once
-)
+# Error of images with which a scene may begin as it ends, half a step of 8 bits: points of one value tell an even one at once.
+NOTHING_LEFT = 0.5 / 255
 CAUSE = (FloatingPointError, SceneError, RuntimeError)
 
 
