@@ -58,7 +58,8 @@ def test_a_number_that_would_end_the_run_when_it_is_used_is_refused_by_name(name
     ("name", "key"),
     [
         ("costs", "every"), ("costs", "fps_views"), ("costs", "fps_repeats"), ("probes", "times"), ("surfaces", "views"),
-        ("surfaces", "share"), ("turntable", "frames"), ("turntable", "size"), ("statistics", "every"),
+        ("surfaces", "share"), ("turntable", "frames"), ("turntable", "size"), ("statistics", "every"), ("learned", "views"),
+        ("finite", "every"),
     ],
 )  # fmt: skip
 def test_where_there_has_to_be_one_none_is_refused(name, key):
