@@ -370,7 +370,7 @@ def _composite_tile_backward(
             g = splat(0.0)
             for modality in range(modalities(layout)):
                 alpha, passed = _alpha(layout, modality, records, rank, density, reached)
-                unclamped = passed & (alpha < ALPHA_MAX)
+                unclamped = alpha < ALPHA_MAX
                 place = (here * modalities(layout) + modality) * 2
                 alpha, weight, after, taken = _take(alpha, passed, load_vector(state, place))
                 gain = weight * along[modality]
@@ -378,7 +378,9 @@ def _composite_tile_backward(
                 store_vector(state, place, after)
                 store_vector(state, place + 1, rest)
                 weights[modality] = weight
-                v_log_alpha = select(unclamped & taken, gain - rest * (alpha / (1.0 - alpha)), 0.0)
+                # One mask at a time: a skipped alpha is 0, and LLVM narrows and widens masks that it joins for AVX2.
+                ratio = select(taken, alpha / (1.0 - alpha), 0.0)
+                v_log_alpha = select(unclamped, gain - rest * ratio, 0.0)
                 column = OPACITY_GRADIENTS + modality
                 sums[column] = sums[column] + v_log_alpha
                 g = g + v_log_alpha
