@@ -119,18 +119,18 @@ def test_gradients_are_those_of_finite_differences_and_leave_the_geometry_alone(
 
 @pytest.mark.parametrize("lr_tilt", [5e-3, 0.0])
 def test_heat_refines_normals(lr_tilt):
-    """A normal that is 20 degrees off, and views that show it from 40 sides."""
+    """A normal that is 20 degrees off, and views that show it from twelve sides."""
     truth, off = (0.0, 0.0, 1.0), (math.sin(math.radians(20)), 0.0, math.cos(math.radians(20)))
     part = ready(falloff=0.5, power=1, lr_tilt=lr_tilt)
     seen, known = splats_of(part, [off]), splats_of(part, [truth])
-    turns = [2 * math.pi * k / 40 for k in range(40)]
+    turns = [2 * math.pi * k / 12 for k in range(12)]
     cameras = [looking_from((6 * math.cos(t), 6 * math.sin(t), 4 + 2 * math.sin(3 * t))) for t in turns]
     value = torch.tensor([[0.9]])
     learned = [seen["normal_tilt"]] if lr_tilt else list(part.parameters())
-    adam = torch.optim.Adam(learned, 1e-2 if lr_tilt else 0.0)
+    adam = torch.optim.Adam(learned, 2.5e-2 if lr_tilt else 0.0)
     with torch.no_grad():
         recorded = [part(value, known, Query(camera=one)) for one in cameras]
-    for _ in range(150 if lr_tilt else 1):
+    for _ in range(60 if lr_tilt else 1):
         adam.zero_grad()
         errors = [part(value, seen, Query(camera=one)) - image for one, image in zip(cameras, recorded, strict=True)]
         torch.cat(errors).square().sum().backward()

@@ -131,7 +131,7 @@ class EnergyBalance(ThermalModel):
     narrowest_range_k = KELVIN_RANGE
     optional = frozenset({"raw_wind"})
     # On days that no image shows, small errors of all parameters add up, so the mean is over more updates than elsewhere; and
-    # attributes of Gaussians that start opaque scatter more (docs/presets.md).
+    # attributes of Gaussians that start opaque scatter more (docs/defaults.md).
     averaged = 0.5
     start_opacity = 0.1
     beyond_record = "the recorded weather drives the balance of heat on, and without weather there is no answer"

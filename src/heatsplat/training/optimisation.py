@@ -17,7 +17,7 @@ from heatsplat.training.adam import OnePassAdam
 from heatsplat.training.decoupled import DecoupledDecay
 
 PUBLISHED_STEPS = 30_000  # for which 3DGS and the methods that build on it chose their rates
-FASTEST = 5.0  # times those rates: at eight times them a run of 1300 steps does worse than at four (docs/presets.md)
+FASTEST = 5.0  # times those rates: at eight times them a run of 1300 steps does worse than at four (docs/defaults.md)
 
 
 def penalties(item: PerGaussian, count: int) -> dict[str, float]:
@@ -115,7 +115,7 @@ class Optimisation:
         """Share of the run in which a rate stays that is held for ``share`` of the shortest: none of a run of the papers' length.
 
         A rate that falls to a 500th by the papers' law is below a fifth of itself for three quarters of a run. Of 30,000 steps
-        the rest is enough, of 2,000 it is not (docs/presets.md).
+        the rest is enough, of 2,000 it is not (docs/defaults.md).
         """
         return share * (1 - self.pace**-2)
 
