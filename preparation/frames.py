@@ -144,7 +144,8 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     frames = [_zoned(frame, reading.zone) for frame in frames]
     _check_names(frames)
     if all(frame.time is not None for frame in frames):
-        frames.sort(key=lambda f: (instant(f.time), f.name))
+        _check_zones(frames)
+        frames.sort(key=lambda f: instant(f.time))  # of one moment, as in a burst, by the numbers in their names, as they came
     else:
         notes.append(
             f"{sum(f.time is None for f in frames)} of {len(frames)} frames have no time, so all are in the order of their "
@@ -360,6 +361,18 @@ def _zoned(frame: ThermalFrame, zone: str | None) -> ThermalFrame:
     if time is not None and time.tzinfo is None and zone is not None:
         time = time.replace(tzinfo=zone_of(zone, "zone"))
     return replace(frame, time=time)
+
+
+def _check_zones(frames: Sequence[ThermalFrame]) -> None:
+    """Raises SceneError where some times state a zone and others none: hours may lie between the two clocks."""
+    without = [frame for frame in frames if frame.time.tzinfo is None]
+    if 0 < len(without) < len(frames):
+        told = next(frame for frame in frames if frame.time.tzinfo is not None)
+        raise SceneError(
+            f"the times of {len(without)} of {len(frames)} frames state no zone, such as {without[0].path.name} "
+            f"({without[0].time.isoformat(' ')}), and the others do, such as {told.path.name} ({told.time.isoformat(' ')}). Give "
+            "the zone that the clock of the former showed, as in zone=Europe/Berlin or zone=UTC"
+        )
 
 
 def _check_names(frames: list[ThermalFrame]) -> None:

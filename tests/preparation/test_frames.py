@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from camera_files import dji_jpeg, raw_for, temperatures, with_segment
+from PIL import Image
 from recordings import START, STATED, read_frames, write_flir, write_images, write_sequence
 
 from heatsplat.contracts import SceneError
@@ -131,6 +132,33 @@ def test_a_zone_is_given_to_times_that_have_none(tmp_path):
     assert frame.time.astimezone(UTC) == datetime(2024, 7, 1, 10, tzinfo=UTC)
     with pytest.raises(SceneError, match="zone=Mars is no time zone"):
         read_frames(tmp_path, Reading(zone="Mars"))
+
+
+def test_times_of_which_only_some_state_a_zone_are_asked_about(tmp_path):
+    """Such as where the zone is told by GPS, which some frames lack: two hours would lie between frames of one second."""
+    for index, zone in enumerate(("+02:00", "", "+02:00")):
+        _with_clock(tmp_path / f"f{index}.png", f"2024:07:01 12:00:0{index}", zone)
+    with pytest.raises(SceneError, match=r"1 of 3 frames state no zone, such as f1.png .*, such as f0.png .* zone="):
+        read_frames(tmp_path)
+    frames = read_frames(tmp_path, Reading(zone="Europe/Berlin"))
+    assert [frame.name for frame in frames] == ["f0", "f1", "f2"]
+    assert {frame.time.utcoffset() for frame in frames} == {timedelta(hours=2)}
+    _with_clock(tmp_path / "f3.png", "", "")  # without a time no frame has one that counts
+    assert [frame.name for frame in read_frames(tmp_path)] == ["f0", "f1", "f2", "f3"]
+
+
+def test_frames_of_one_second_are_in_the_order_of_the_numbers_in_their_names(tmp_path):
+    for number, second in ((8, 1), (9, 1), (10, 1), (11, 0)):
+        _with_clock(tmp_path / f"f{number}.png", f"2024:07:01 12:00:0{second}", "")
+    assert [frame.name for frame in read_frames(tmp_path)] == ["f11", "f8", "f9", "f10"]
+
+
+def _with_clock(path: Path, clock: str, zone: str) -> None:
+    """Counts of kelvin x 100 whose EXIF has a time, unless it is empty."""
+    exif = Image.Exif()
+    exif[0x10F] = "Maker"
+    exif.get_ifd(0x8769).update({tag: text for tag, text in ((0x9003, clock), (0x9011, zone)) if text})
+    Image.fromarray((100 * (FLOATS + 273.15)).astype(np.uint16)).save(path, exif=exif)
 
 
 def test_folders_that_cannot_be_understood_are_refused_by_name(tmp_path):
