@@ -145,7 +145,7 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     _check_names(frames)
     if all(frame.time is not None for frame in frames):
         _check_zones(frames)
-        frames.sort(key=lambda f: instant(f.time))  # of one moment, as in a burst, by the numbers in their names, as they came
+        frames.sort(key=lambda f: instant(f.time))  # those of one second stay in the order of their numbers
     else:
         notes.append(
             f"{sum(f.time is None for f in frames)} of {len(frames)} frames have no time, so all are in the order of their "
