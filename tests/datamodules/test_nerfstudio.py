@@ -11,6 +11,7 @@ from layouts import FOCAL, HEIGHT, WIDTH, grey, names, opengl, viewmats, write_c
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in
 from heatsplat.datamodules.nerfstudio import Nerfstudio
 
 LENS = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 20.0, "cy": 16.0, "w": WIDTH, "h": HEIGHT}
@@ -148,6 +149,32 @@ def test_a_fisheye_of_instant_ngp_is_one(tmp_path):
     write_frames(tmp_path / "ngp", [{"file_path": "0.png"}], is_fisheye=True, camera_model="OPENCV")
     with pytest.raises(SceneError, match="is_fisheye is true, but camera_model is FULL_OPENCV; keep one of them"):
         loaded(tmp_path / "ngp")
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (
+            {"camera_model": "OPENCV", "k4": 0.1},
+            "k4 is 0.1, and camera model OPENCV has no k4; say camera_model FULL_OPENCV",
+        ),
+        ({"k4": 0.1}, "camera model OPENCV has no k4"),
+        (
+            {"camera_model": "PINHOLE", "k1": -0.2, "k2": None},
+            "k1 is -0.2, .* PINHOLE has no k1; say camera_model OPENCV",
+        ),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.01}, "camera model OPENCV_FISHEYE has no p1; undistort"),
+    ],
+)
+def test_distortion_that_the_camera_model_does_not_have_is_refused(tmp_path, values, said):
+    """nerfstudio's k4 is the factor of r^8, OpenCV's divides by 1 + k4 r^2: nerfstudio undistorts no image with it, either."""
+    lens = {"fl_x": 50.0, "w": WIDTH, "h": HEIGHT}
+    with pytest.raises(SceneError, match=said):
+        lens_in(Transforms(tmp_path, lens | values, []), {"file_path": "0.png"}, lambda: (WIDTH, HEIGHT))
+    named = lens_in(
+        Transforms(tmp_path, lens, []), {"file_path": "0.png", "camera_model": "FULL_OPENCV", "k4": 0.1}, None
+    )
+    assert named.distortion == (0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0)
 
 
 def test_a_folder_thermal_with_cameras_of_its_own(tmp_path):
