@@ -378,7 +378,7 @@ class Search:
         about = device.like.camera
         if not about.field_of_view_deg:
             return None if about.focal_mm is None else 1000.0 * about.focal_mm / self.options.pixel_um
-        return 0.5 * device.like.pixels().shape[1] / float(np.tan(np.radians(0.5 * about.field_of_view_deg)))
+        return 0.5 * device.like.load().shape[1] / float(np.tan(np.radians(0.5 * about.field_of_view_deg)))
 
     def _device(self, copy: str) -> int | None:
         """Which of the thermal cameras took a copy; None for photos."""
@@ -396,8 +396,9 @@ class Search:
 
     def _set_focal_lengths(self, database: pycolmap.Database) -> None:
         """Gives thermal cameras in the database the focal lengths that are known."""
+        lengths = [self._focal(device) for device in self.devices]  # each of which may read a file
         known = {
-            image.camera_id: self._focal(self.devices[self._device(image.name)])
+            image.camera_id: lengths[self._device(image.name)]
             for image in database.read_all_images()
             if image.name in self.name_of
         }
