@@ -227,7 +227,7 @@ def _frames_of(
             load = partial(read_temperature_table, path)
             found.append(ThermalFrame(frame_name(path, folder), path, 0, load, size=tables[path]))
             continue
-        details, camera = exif_details(read_bytes(path))
+        details, camera = exif_details(path)  # of the file: a TIFF may be a recording that memory cannot hold
         _, size = _mode_and_size(path)
         pages = pages_of(path)
         if several := len(pages) > 1:

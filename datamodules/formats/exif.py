@@ -6,6 +6,7 @@ import io
 import logging
 import math
 from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
 from typing import Any
 
 from PIL import Image
@@ -16,14 +17,14 @@ EXIF, GPS = 0x8769, 0x8825  # directories
 MAKE, MODEL, TAKEN, TAKEN_ZONE, THOUSANDTHS, FOCAL, SERIAL = 0x10F, 0x110, 0x9003, 0x9011, 0x9291, 0x920A, 0xA431
 
 
-def exif_in(data: bytes) -> dict[str, Any]:
-    """What the EXIF of a picture says; only what is there, and nothing for what is damaged or no picture.
+def exif_in(source: bytes | Path) -> dict[str, Any]:
+    """What the EXIF of a picture, or of the file of one, says; only what is there, and nothing for what is damaged or no picture.
 
     "make", "model", "serial", "focal_mm", "time" (with the zone where the file has one), "latitude_deg", "longitude_deg" and
     "altitude_m".
     """
     try:
-        with Image.open(io.BytesIO(data)) as picture:
+        with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as picture:
             whole = picture.getexif()
             taken, gps = whole.get_ifd(EXIF), whole.get_ifd(GPS)
             found = {"make": whole.get(MAKE), "model": whole.get(MODEL), "serial": taken.get(SERIAL)}
