@@ -7,6 +7,7 @@ The layouts are those of COLMAP's ``src/colmap/scene/reconstruction_io_binary.cc
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import takewhile
 from pathlib import Path
 from struct import Struct, error
 
@@ -43,6 +44,26 @@ def check_records(folder: Path, suffix: str) -> None:
             points_told = _check_text(file, _TEXT[part], paired=True)
         else:
             _check_text(file, _TEXT[part], may_be_empty=part == "points3D" and not points_told)
+
+
+def announced_images(folder: Path) -> int:
+    """How many images the model in a folder says that it has, by the first lines of its files; 0 where none says it."""
+    binary, text = folder / "images.bin", folder / "images.txt"
+    try:
+        if binary.is_file():
+            with binary.open("rb") as file:
+                return _COUNT.unpack(file.read(_COUNT.size))[0]
+        with text.open(encoding="utf-8", errors="replace") as file:
+            counts = (_announced(line) for line in takewhile(lambda line: line.startswith("#"), file))
+            return next((count for count in counts if count is not None), 0)
+    except (OSError, error):
+        return 0
+
+
+def _announced(line: str) -> int | None:
+    """The number of records that a comment in a text file tells, or None."""
+    word = line.partition(":")[2].partition(",")[0].strip()
+    return int(word) if line.startswith("# Number of ") and word.isdigit() else None
 
 
 def _check_binary(file: Path, end_of: Callable[[bytes, int], int]) -> None:
@@ -127,8 +148,7 @@ def _check_text(
     while number < len(lines):
         line, number = lines[number].strip(), number + 1
         if line.startswith("# Number of "):
-            word = line.partition(":")[2].partition(",")[0].strip()
-            announced = int(word) if word.isdigit() else None
+            announced = _announced(line)
         if not line or line.startswith("#"):
             continue
         found += 1

@@ -77,7 +77,7 @@ def _path_in(frame: dict[str, Any], keys: Sequence[str], used: set[str]) -> str 
             value = value.get("file_path")
         if isinstance(value, str) and value:
             used.add(key)
-            return value
+            return value.replace("\\", "/")  # as instant-ngp writes them on Windows
     return None
 
 

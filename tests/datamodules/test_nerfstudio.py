@@ -135,6 +135,14 @@ def test_fields_of_view_tell_both_focal_lengths(tmp_path):
         assert [float(K[0, 0]), float(K[1, 1])] == pytest.approx([fx, fy]), given
 
 
+def test_paths_of_windows_are_paths(tmp_path):
+    """colmap2nerf of instant-ngp writes the folder of the images as the system does."""
+    for i in range(9):
+        write_image(tmp_path / "ir" / "day" / f"{i}.png", grey(i))
+    write_frames(tmp_path, [{"file_path": f".\\ir\\day/{i}.png"} for i in range(9)])
+    assert len(loaded(tmp_path).train) == 7
+
+
 def test_a_fisheye_of_instant_ngp_is_one(tmp_path):
     """Its files name no camera model, only is_fisheye: the same k1 to k4 are those of another lens."""
     coefficients = {"k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": -0.001}
