@@ -190,16 +190,25 @@ def _mode_and_size(path: Path) -> tuple[str, tuple[int, int]]:
         raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
     except UnidentifiedImageError:  # such as TIFF of 64 bits, which Pillow does not know
         pixels = read_image(path, 0)
+        if pixels.ndim == 3 and pixels.dtype.kind == "f":
+            raise SceneError(
+                f"image {path} has {pixels.shape[2]} channels of floats, and temperatures are one; export them alone"
+            ) from None
         return "F" if pixels.dtype.kind == "f" else "I", (pixels.shape[1], pixels.shape[0])
     except Exception as error:  # Pillow raises whatever a damaged file leads to
         raise SceneError(f"image {path} is corrupt or no image; copy it again or remove it ({error})") from error
 
 
 def _greys_in_colour(kinds: dict[str, list[Path]], folder: Path) -> dict[str, list[Path]]:
-    """Greys that were stored as colours count as greys. Raises SceneError where the pictures are pseudo-colours or photos."""
+    """Greys that were stored as colours count as greys, those of 16 bits as counts.
+
+    Raises:
+        SceneError: the pictures are pseudo-colours or photos.
+    """
     colour = kinds.get("colour", [])
-    if colour and all(colour_levels(read_image(path, 0)[..., :3]) < PSEUDO_COLOUR_LEVELS for path in colour[:3]):
-        return {"grey": colour}
+    few = [read_image(path, 0)[..., :3] for path in colour[:3]]
+    if few and all(colour_levels(pixels) < PSEUDO_COLOUR_LEVELS for pixels in few):
+        return {"counts" if few[0].dtype == np.uint16 else "grey": colour}
     if colour:
         raise SceneError(
             f"{folder} holds coloured pictures alone (such as {colour[0].name}): colours of a palette are no temperatures. "
@@ -235,7 +244,7 @@ def _frames_of(
             notes.append(f"{path.name}: {len(pages)} images in one file, each is a frame")
         for number, page in enumerate(pages):
             name = frame_name(path, folder, number if several else None)
-            load = partial(_grey if kind == "grey" else read_image, path, page if several else None)
+            load = partial(read_image if kind == "float" else _grey, path, page if several else None)
             found.append(ThermalFrame(name, path, number, load, camera=camera, size=size, **details))
     calibrations = _calibrations(kind, found, folder, reading.meaning, notes)
     yield from (replace(frame, calibration=calibrations[frame.path]) for frame in found)

@@ -221,6 +221,24 @@ def test_greys_that_were_stored_as_colours_are_greys(tmp_path):
     np.testing.assert_allclose(frame.temperature(), FLOATS, atol=0.21)
 
 
+@pytest.mark.parametrize(("ending", "channels"), [("png", 3), ("png", 4), ("tiff", 3)])
+def test_counts_that_were_stored_as_colours_are_counts(tmp_path, ending, channels):
+    """Of 16 bits: as greys of 8 bits 300 K would be 5,800 °C between bounds of 0 and 50, and no temperature without."""
+    counts = (100 * (FLOATS + 273.15)).astype(np.uint16)
+    write_images(tmp_path, {f"a.{ending}": np.dstack([counts] * 3 + [np.full_like(counts, 65535)] * (channels - 3))})
+    (frame,) = read_frames(tmp_path)
+    np.testing.assert_array_equal(frame.load(), counts)
+    np.testing.assert_allclose(frame.temperature(), FLOATS, atol=0.011)
+    with pytest.raises(SceneError, match="bounds_c changes nothing for 16-bit images; .* said by counts.scale"):
+        read_frames(tmp_path, Reading(Meaning(bounds_c=[0, 50])))
+
+
+def test_floats_of_several_channels_are_refused(tmp_path):
+    write_images(tmp_path, {"a.tiff": np.dstack([FLOATS] * 3)})
+    with pytest.raises(SceneError, match="a.tiff has 3 channels of floats, and temperatures are one"):
+        read_frames(tmp_path)
+
+
 @needs_data
 def test_real_files_give_the_temperatures_that_are_stated_for_them(tmp_path):
     """PROVENANCE: FLIR ONE about -10 .. 27 °C; M3T within 23.6 .. 52.9 °C; ThermoScenes' greys between their bounds."""
