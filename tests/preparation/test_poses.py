@@ -13,6 +13,7 @@ import torch
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.colmap import read_model
+from heatsplat.datamodules.formats.colmap_library import pycolmap
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, flight, write_camera
 from heatsplat.datamodules.synthetic_scene.film import Size
 from heatsplat.geometry.alignment import pose_errors
@@ -112,6 +113,22 @@ def test_focal_lengths_are_told_by_one_frame_of_a_camera(tmp_path):
     search._set_focal_lengths(database)
     assert camera.params == [pytest.approx(4.0), 4.0, 2.0] and camera.has_prior_focal_length
     assert len(loaded) == 1
+
+
+def test_the_database_is_asked_for_a_camera_until_it_has_one(tmp_path, monkeypatch):
+    """It lists all of its images each time: asked for every frame, that is their square."""
+    search, asked = search_of(tmp_path, 6), []
+    rng = np.random.default_rng(0)
+    for copy in search.name_of:
+        (search.work / "images" / copy).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(search.work / "images" / copy), rng.integers(0, 255, (48, 64)).astype(np.uint8))
+    own = Search._camera_of
+    monkeypatch.setattr(Search, "_camera_of", lambda *given: asked.append(given) or own(*given))
+    search.find_features()
+    assert len(asked) == 2  # the first image has none yet
+    with pycolmap.Database.open(search.database) as database:
+        images = database.read_all_images()
+    assert len(images) == 6 and len({image.camera_id for image in images}) == 1
 
 
 def test_gps_counts_where_it_tells_frames_apart(tmp_path):
