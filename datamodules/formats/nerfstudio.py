@@ -142,7 +142,7 @@ def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tu
     model = _COLMAP_NAME.get(said, said)
     source = f"{transforms.path}, {frame['file_path']}"
     if values.get("is_fisheye") and "FISHEYE" not in model:
-        raise SceneError(f"{source}: is_fisheye is true, but camera_model is {model}; keep one of them")
+        raise SceneError(f"{source}: is_fisheye is true, but camera_model is {said}; keep one of them")
     if model not in MODELS:
         lens_of(model, (), 0, 0, source)  # raises, naming the supported models
 

@@ -155,7 +155,7 @@ def test_a_fisheye_of_instant_ngp_is_one(tmp_path):
         ngp.train[0].camera.K, named.train[0].camera.K
     )
     write_frames(tmp_path / "ngp", [{"file_path": "0.png"}], is_fisheye=True, camera_model="OPENCV")
-    with pytest.raises(SceneError, match="is_fisheye is true, but camera_model is FULL_OPENCV; keep one of them"):
+    with pytest.raises(SceneError, match="is_fisheye is true, but camera_model is OPENCV; keep one of them"):
         loaded(tmp_path / "ngp")
 
 
