@@ -16,6 +16,7 @@ from PIL import Image, UnidentifiedImageError
 
 from heatsplat.contracts import SceneError, counted, evenly_spread
 from heatsplat.datamodules.formats import dji, flir
+from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import (
     PSEUDO_COLOUR_LEVELS,
     SUFFIXES,
@@ -41,6 +42,8 @@ from heatsplat.preparation.table import with_table
 MODALITY = re.compile(r"[_\-. ](T|V|W|Z|S|IR|R|RGB|VIS|thermal|visible|visual|photo)$", re.IGNORECASE)
 DJI_CLOCK = re.compile(r"DJI_(\d{14})_(?=\d+)")
 SAME_EXPOSURE_S = 5.0  # by which the clocks in the names of one exposure's files may differ
+# A fix farther from the middle of all than so many times the median distance, and than so many metres, is of another place.
+ASTRAY, ASTRAY_M = 20.0, 1000.0
 # A picture of temperatures: levels of these explain 0.99 of it, of photos 0.2 to 0.9 (a house against the sky).
 PREVIEW, LEVELS, LOOKED_AT = 0.95, 64, 3
 KINDS = {
@@ -141,7 +144,7 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     frames = _paired(frames, _without_previews(frames, photos, notes))
     if reading.table is not None:
         frames = with_table(frames, reading.table, reading.columns, notes)
-    frames = [_zoned(frame, reading.zone) for frame in frames]
+    frames = _without_fixes_of_earlier_places([_zoned(frame, reading.zone) for frame in frames], notes)
     _check_names(frames)
     if all(frame.time is not None for frame in frames):
         _check_zones(frames)
@@ -370,6 +373,25 @@ def _zoned(frame: ThermalFrame, zone: str | None) -> ThermalFrame:
     if time is not None and time.tzinfo is None and zone is not None:
         time = time.replace(tzinfo=zone_of(zone, "zone"))
     return replace(frame, time=time)
+
+
+def _without_fixes_of_earlier_places(frames: list[ThermalFrame], notes: list[str]) -> list[ThermalFrame]:
+    """The frames, without positions that lie in another place than those of the others: a receiver tells where it was last until
+    it knows better."""
+    placed = [frame for frame in frames if frame.position is not None]
+    if len(placed) < 3:
+        return frames
+    fixes = np.array([(frame.position.latitude_deg, frame.position.longitude_deg, 0.0) for frame in placed])
+    away = np.linalg.norm(east_north_up(fixes, np.median(fixes, axis=0))[:, :2], axis=1)
+    far = away > max(ASTRAY * float(np.median(away)), ASTRAY_M)
+    if not far.any():
+        return frames
+    astray = {frame.name for frame, one in zip(placed, far, strict=True) if one}
+    notes.append(
+        f"GPS of {counted(len(astray), 'frame')}, such as {min(astray)}, lies {away.max() / 1000:.3g} km from that of the "
+        "others, as where the receiver was before, and is left out"
+    )
+    return [replace(frame, position=None) if frame.name in astray else frame for frame in frames]
 
 
 def _check_zones(frames: Sequence[ThermalFrame]) -> None:

@@ -153,6 +153,25 @@ def test_frames_of_one_second_are_in_the_order_of_the_numbers_in_their_names(tmp
     assert [frame.name for frame in read_frames(tmp_path)] == ["f11", "f8", "f9", "f10"]
 
 
+def test_a_fix_of_an_earlier_place_is_left_out(tmp_path):
+    """It would be the origin of the world, hundreds of kilometres away and not level, and shift a map."""
+    write_images(tmp_path / "files", {f"f{i}.tiff": FLOATS for i in range(8)})
+    columns = {"name": "file", "latitude_deg": "lat", "longitude_deg": "lon"}
+    reading = Reading(table=tmp_path / "table.csv", columns=columns)
+
+    def placed(first: str) -> tuple[list[bool], str]:
+        rows = [f"f0,{first}", *(f"f{i},{51 + 1e-4 * i},4" for i in range(1, 8))]
+        reading.table.write_text("\n".join(["file,lat,lon", *rows]))
+        found = read_recording(tmp_path / "files", reading)
+        return [frame.position is not None for frame in found.frames], " ".join(found.notes)
+
+    near, far = placed("51.008,4"), placed("48.1,11.5")
+    assert near[0] == [True] * 8 and "GPS" not in near[1]  # 0.8 km
+    assert (
+        far[0] == [False] + [True] * 7 and "GPS of 1 frame, such as f0, lies 630 km from that of the others" in far[1]
+    )
+
+
 def _with_clock(path: Path, clock: str, zone: str) -> None:
     """Counts of kelvin x 100 whose EXIF has a time, unless it is empty."""
     exif = Image.Exif()
