@@ -14,6 +14,7 @@ from heatsplat.contracts import SceneError, counted
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.formats import temperature_table
 from heatsplat.datamodules.formats.colmap import SparseModel
+from heatsplat.datamodules.formats.colmap_records import announced_images
 from heatsplat.datamodules.formats.images import ImageIndex
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
 from heatsplat.datamodules.formats.radiometric import read_thermal
@@ -43,7 +44,8 @@ def image_index(folder: Path, images: str, key: str) -> ImageIndex:
 def match_model(
     model: SparseModel, files: dict[str, str | None], index: ImageIndex, folder: str
 ) -> tuple[list[str], dict[str, Any]]:
-    """Names of the model that have a file, and notes about those that do not and about files that are not registered.
+    """Names of the model that have a file, and notes about those that do not, about files that are not registered, and about a
+    larger model beside it, of which the log warns.
 
     Raises:
         SceneError: no name of the model has a file.
@@ -54,7 +56,7 @@ def match_model(
             f"none of the {len(model.names)} images of the sparse model {model.folder} is in {index.folder}: the model "
             f"has names like {model.names[0]!r}, the folder like {index.names[0]!r}"
         )
-    notes: dict[str, Any] = {"registered": len(model.names)}
+    notes: dict[str, Any] = {"registered": len(model.names), **_told_larger(model)}
     missing = [name for name in model.names if files[name] is None]
     notes |= told_missing(missing, len(model.names), f"a file in {folder}/", index.folder)
     if unregistered := index.unused(f for f in files.values() if f):
@@ -62,6 +64,22 @@ def match_model(
             f"{counted(len(unregistered), 'file')} not in the model, unused: {_some(unregistered)}"
         )
     return kept, notes
+
+
+def _told_larger(model: SparseModel) -> dict[str, Any]:
+    """A note on a model of more images beside one in sparse/0, sparse/1, ..., of which the log warns too; none without such.
+
+    COLMAP numbers models that do not connect in the order in which it began them.
+    """
+    beside = [
+        folder for folder in model.folder.parent.glob("[0-9]*") if folder.name.isdigit() and folder != model.folder
+    ]
+    largest = max(beside, key=announced_images, default=None)
+    if not model.folder.name.isdigit() or largest is None or announced_images(largest) <= len(model.names):
+        return {}
+    note = f"{counted(len(model.names), 'image')}, and {largest.name} beside it has {announced_images(largest)}"
+    log.warning("%s has %s: put that model in its place to train on those", model.folder, note)
+    return {"larger_model": note}
 
 
 def told_missing(missing: Sequence[str], count: int, lacking: str, folder: Path) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from PIL import Image, UnidentifiedImageError
 
 from heatsplat.contracts import SceneError, counted, evenly_spread
 from heatsplat.datamodules.formats import dji, flir
+from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import (
     PSEUDO_COLOUR_LEVELS,
     SUFFIXES,
@@ -41,6 +42,8 @@ from heatsplat.preparation.table import with_table
 MODALITY = re.compile(r"[_\-. ](T|V|W|Z|S|IR|R|RGB|VIS|thermal|visible|visual|photo)$", re.IGNORECASE)
 DJI_CLOCK = re.compile(r"DJI_(\d{14})_(?=\d+)")
 SAME_EXPOSURE_S = 5.0  # by which the clocks in the names of one exposure's files may differ
+# A fix farther from the middle of all than so many times the median distance, and than so many metres, is of another place.
+ASTRAY, ASTRAY_M = 20.0, 1000.0
 # A picture of temperatures: levels of these explain 0.99 of it, of photos 0.2 to 0.9 (a house against the sky).
 PREVIEW, LEVELS, LOOKED_AT = 0.95, 64, 3
 KINDS = {
@@ -141,10 +144,11 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     frames = _paired(frames, _without_previews(frames, photos, notes))
     if reading.table is not None:
         frames = with_table(frames, reading.table, reading.columns, notes)
-    frames = [_zoned(frame, reading.zone) for frame in frames]
+    frames = _without_fixes_of_earlier_places([_zoned(frame, reading.zone) for frame in frames], notes)
     _check_names(frames)
     if all(frame.time is not None for frame in frames):
-        frames.sort(key=lambda f: (instant(f.time), f.name))
+        _check_zones(frames)
+        frames.sort(key=lambda f: instant(f.time))  # those of one second stay in the order of their numbers
     else:
         notes.append(
             f"{sum(f.time is None for f in frames)} of {len(frames)} frames have no time, so all are in the order of their "
@@ -189,16 +193,25 @@ def _mode_and_size(path: Path) -> tuple[str, tuple[int, int]]:
         raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
     except UnidentifiedImageError:  # such as TIFF of 64 bits, which Pillow does not know
         pixels = read_image(path, 0)
+        if pixels.ndim == 3 and pixels.dtype.kind == "f":
+            raise SceneError(
+                f"image {path} has {pixels.shape[2]} channels of floats, and temperatures are one; export them alone"
+            ) from None
         return "F" if pixels.dtype.kind == "f" else "I", (pixels.shape[1], pixels.shape[0])
     except Exception as error:  # Pillow raises whatever a damaged file leads to
         raise SceneError(f"image {path} is corrupt or no image; copy it again or remove it ({error})") from error
 
 
 def _greys_in_colour(kinds: dict[str, list[Path]], folder: Path) -> dict[str, list[Path]]:
-    """Greys that were stored as colours count as greys. Raises SceneError where the pictures are pseudo-colours or photos."""
+    """Greys that were stored as colours count as greys, those of 16 bits as counts.
+
+    Raises:
+        SceneError: the pictures are pseudo-colours or photos.
+    """
     colour = kinds.get("colour", [])
-    if colour and all(colour_levels(read_image(path, 0)[..., :3]) < PSEUDO_COLOUR_LEVELS for path in colour[:3]):
-        return {"grey": colour}
+    few = [read_image(path, 0)[..., :3] for path in colour[:3]]
+    if few and all(colour_levels(pixels) < PSEUDO_COLOUR_LEVELS for pixels in few):
+        return {"counts" if few[0].dtype == np.uint16 else "grey": colour}
     if colour:
         raise SceneError(
             f"{folder} holds coloured pictures alone (such as {colour[0].name}): colours of a palette are no temperatures. "
@@ -226,7 +239,7 @@ def _frames_of(
             load = partial(read_temperature_table, path)
             found.append(ThermalFrame(frame_name(path, folder), path, 0, load, size=tables[path]))
             continue
-        details, camera = exif_details(read_bytes(path))
+        details, camera = exif_details(path)  # of the file: a TIFF may be a recording that memory cannot hold
         _, size = _mode_and_size(path)
         pages = pages_of(path)
         if several := len(pages) > 1:
@@ -234,7 +247,7 @@ def _frames_of(
             notes.append(f"{path.name}: {len(pages)} images in one file, each is a frame")
         for number, page in enumerate(pages):
             name = frame_name(path, folder, number if several else None)
-            load = partial(_grey if kind == "grey" else read_image, path, page if several else None)
+            load = partial(read_image if kind == "float" else _grey, path, page if several else None)
             found.append(ThermalFrame(name, path, number, load, camera=camera, size=size, **details))
     calibrations = _calibrations(kind, found, folder, reading.meaning, notes)
     yield from (replace(frame, calibration=calibrations[frame.path]) for frame in found)
@@ -360,6 +373,37 @@ def _zoned(frame: ThermalFrame, zone: str | None) -> ThermalFrame:
     if time is not None and time.tzinfo is None and zone is not None:
         time = time.replace(tzinfo=zone_of(zone, "zone"))
     return replace(frame, time=time)
+
+
+def _without_fixes_of_earlier_places(frames: list[ThermalFrame], notes: list[str]) -> list[ThermalFrame]:
+    """The frames, without positions that lie in another place than those of the others: a receiver tells where it was last until
+    it knows better."""
+    placed = [frame for frame in frames if frame.position is not None]
+    if len(placed) < 3:
+        return frames
+    fixes = np.array([(frame.position.latitude_deg, frame.position.longitude_deg, 0.0) for frame in placed])
+    away = np.linalg.norm(east_north_up(fixes, np.median(fixes, axis=0))[:, :2], axis=1)
+    far = away > max(ASTRAY * float(np.median(away)), ASTRAY_M)
+    if not far.any():
+        return frames
+    astray = {frame.name for frame, one in zip(placed, far, strict=True) if one}
+    notes.append(
+        f"GPS of {counted(len(astray), 'frame')}, such as {min(astray)}, lies {away.max() / 1000:.3g} km from that of the "
+        "others, as where the receiver was before, and is left out"
+    )
+    return [replace(frame, position=None) if frame.name in astray else frame for frame in frames]
+
+
+def _check_zones(frames: Sequence[ThermalFrame]) -> None:
+    """Raises SceneError where some times state a zone and others none: hours may lie between the two clocks."""
+    without = [frame for frame in frames if frame.time.tzinfo is None]
+    if 0 < len(without) < len(frames):
+        told = next(frame for frame in frames if frame.time.tzinfo is not None)
+        raise SceneError(
+            f"the times of {len(without)} of {len(frames)} frames state no zone, such as {without[0].path.name} "
+            f"({without[0].time.isoformat(' ')}), and the others do, such as {told.path.name} ({told.time.isoformat(' ')}). Give "
+            "the zone that the clock of the former showed, as in zone=Europe/Berlin or zone=UTC"
+        )
 
 
 def _check_names(frames: list[ThermalFrame]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.file_names import same_files
-from heatsplat.datamodules.formats.colmap import find_model, read_model, write_model
+from heatsplat.datamodules.formats.colmap import find_model, is_model, read_model_of, write_model
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
 from heatsplat.datamodules.nerfstudio import find_transforms
@@ -96,11 +96,12 @@ class GivenPoses:
 
 def model_in(folder: Path, frames: Sequence[ThermalFrame]) -> Model:
     """The cameras in a folder, a COLMAP model before a transforms.json. Raises SceneError where it holds neither."""
-    for place in (folder, folder.parent, folder.parent.parent):  # the folder of the model itself is as good
-        if (found := find_model(place)) is not None and (place == folder or found == folder):
-            model = read_model(place)
-            cameras = {n: (v, lens) for n, v, lens in zip(model.names, model.viewmats, model.lenses, strict=True)}
-            return Model(found, cameras, model.points, model.colors)
+    # The folder of the model itself is as good, whatever it is called, and that above sparse/0, sparse/1, ..., too.
+    found = find_model(folder) or next((place for place in (folder, folder / "0") if is_model(place)), None)
+    if found is not None:
+        model = read_model_of(found)
+        cameras = {n: (v, lens) for n, v, lens in zip(model.names, model.viewmats, model.lenses, strict=True)}
+        return Model(found, cameras, model.points, model.colors)
     files = find_transforms(folder)
     if not files:
         raise SceneError(

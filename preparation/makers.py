@@ -151,9 +151,9 @@ def taken_at(data: bytes) -> datetime | None:
     return exif_in(data).get("time")
 
 
-def exif_details(data: bytes) -> tuple[dict[str, object], CameraInfo]:
-    """(time and position as arguments of a frame, camera) as far as a picture's EXIF has them."""
-    found = exif_in(data) if data else {}
+def exif_details(source: bytes | Path) -> tuple[dict[str, object], CameraInfo]:
+    """(time and position as arguments of a frame, camera) as far as the EXIF of a picture, or of its file, has them."""
+    found = exif_in(source) if source else {}
     details = {"time": found["time"]} if "time" in found else {}
     if "latitude_deg" in found:
         details["position"] = Position(found["latitude_deg"], found["longitude_deg"], found.get("altitude_m"))

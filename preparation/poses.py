@@ -183,8 +183,12 @@ class Search:
                     image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)
                 }
         todo = [name for name in names if name in missing]
+        cameras: dict[Any, int] = {}  # by device and shape: asked of the database, which lists all of its images
         for name in _progress(todo, f"finding features in {counted(len(todo), 'image')}"):
-            reader.existing_camera_id = self._camera_of(name)
+            kind = self._device(name), _shape(self.work / "images" / name)
+            if cameras.get(kind, -1) < 0:
+                cameras[kind] = self._camera_of(*kind)
+            reader.existing_camera_id = cameras[kind]
             self.options.features.extract(self.database, self.work / "images", name, reader)
         if not todo:
             return
@@ -378,26 +382,28 @@ class Search:
         about = device.like.camera
         if not about.field_of_view_deg:
             return None if about.focal_mm is None else 1000.0 * about.focal_mm / self.options.pixel_um
-        return 0.5 * device.like.pixels().shape[1] / float(np.tan(np.radians(0.5 * about.field_of_view_deg)))
+        return 0.5 * device.like.load().shape[1] / float(np.tan(np.radians(0.5 * about.field_of_view_deg)))
 
     def _device(self, copy: str) -> int | None:
         """Which of the thermal cameras took a copy; None for photos."""
         return self.device_of[self.frames[self.name_of[copy]].name] if copy in self.name_of else None
 
-    def _camera_of(self, copy: str) -> int:
-        """Number in the database of the camera that took a copy (photos of one size are of one); -1 where it has none yet."""
+    def _camera_of(self, device: int | None, shape: tuple[int, int]) -> int:
+        """Number in the database of the camera that took the copies of a device (of photos for None) of one height and width; -1
+        where it has none yet."""
         if not self.database.is_file():
             return -1
-        height, width = _shape(self.work / "images" / copy)
+        height, width = shape
         with pycolmap.Database.open(self.database) as database:
-            own = {im.camera_id for im in database.read_all_images() if self._device(im.name) == self._device(copy)}
+            own = {im.camera_id for im in database.read_all_images() if self._device(im.name) == device}
             sized = {key: database.read_camera(key) for key in own}
         return next((key for key, camera in sized.items() if (camera.height, camera.width) == (height, width)), -1)
 
     def _set_focal_lengths(self, database: pycolmap.Database) -> None:
         """Gives thermal cameras in the database the focal lengths that are known."""
+        lengths = [self._focal(device) for device in self.devices]  # each of which may read a file
         known = {
-            image.camera_id: self._focal(self.devices[self._device(image.name)])
+            image.camera_id: lengths[self._device(image.name)]
             for image in database.read_all_images()
             if image.name in self.name_of
         }

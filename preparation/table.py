@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
@@ -21,6 +22,7 @@ NUMBERS = {
     Position: ("latitude_deg", "longitude_deg", "altitude_m", "above_takeoff_m"),
     Attitude: ("yaw_deg", "pitch_deg", "roll_deg"),
 }
+MOST_DEG = {"latitude_deg": 90.0, "longitude_deg": 180.0}
 
 
 def with_table(
@@ -143,6 +145,11 @@ class FrameTable:
             used.add("time")
         for field, kind in (("position", Position), ("attitude", Attitude)):
             numbers = {key: value for key in NUMBERS[kind] if (value := self._number(row, key)) is not None}
+            if numbers.get("latitude_deg") == numbers.get("longitude_deg") == 0.0:
+                raise SceneError(
+                    f"{self.table.path}, line {line}: latitude and longitude are 0, as GPS without a fix has them; leave both "
+                    "cells empty"
+                )
             known = getattr(frame, field)
             if numbers and (known is not None or _needed(kind) <= numbers.keys()):
                 changes[field] = kind(**numbers) if known is None else replace(known, **numbers)
@@ -178,12 +185,18 @@ class FrameTable:
         cell = self._cell(cells, key)
         if not cell:
             return None
+        where = f"{self.table.path}, line {line}: {cell!r} in column {self.columns[key]}"
         try:
-            return self.table.number(cell)
+            value = self.table.number(cell)
         except ValueError as error:
+            raise SceneError(f"{where} is no number") from error
+        if not math.isfinite(value):
+            raise SceneError(f"{where} is no number; leave cells empty of which nothing is known")
+        if abs(value) > (most := MOST_DEG.get(key, math.inf)):
             raise SceneError(
-                f"{self.table.path}, line {line}: {cell!r} in column {self.columns[key]} is no number"
-            ) from error
+                f"{where} is no {key.removesuffix('_deg')}, which lies between -{most:g} and {most:g} degrees"
+            )
+        return value
 
 
 def _column_of(key: str, column: str, table: Table) -> str:

@@ -39,10 +39,12 @@ class SparseModel:
 
 def find_model(scene: Path) -> Path | None:
     """The folder of the sparse model in a scene folder (sparse/0, sparse, colmap/sparse/0, colmap/sparse), or None."""
-    for place in PLACES:
-        if any((scene / place / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt")):
-            return scene / place
-    return None
+    return next((scene / place for place in PLACES if is_model(scene / place)), None)
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder is itself one of a sparse model: it has cameras.bin or cameras.txt."""
+    return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
 
 
 def read_model(scene: Path) -> SparseModel:
@@ -57,6 +59,11 @@ def read_model(scene: Path) -> SparseModel:
             f"no sparse model in {scene}: looked for cameras.bin or cameras.txt in {', '.join(PLACES)}. "
             "Reconstruct the scene with COLMAP first, or point data.root and data.scene at the folder above sparse/."
         )
+    return read_model_of(folder)
+
+
+def read_model_of(folder: Path) -> SparseModel:
+    """The sparse model whose files lie in a folder. Raises SceneError as ``read_model``."""
     suffix = "bin" if (folder / "cameras.bin").is_file() else "txt"
     check_records(folder, suffix)
     try:

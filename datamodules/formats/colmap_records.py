@@ -7,6 +7,7 @@ The layouts are those of COLMAP's ``src/colmap/scene/reconstruction_io_binary.cc
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import takewhile
 from pathlib import Path
 from struct import Struct, error
 
@@ -25,9 +26,12 @@ _PARAMS: dict[int, int] = {
 def check_records(folder: Path, suffix: str) -> None:
     """Nothing, for a model whose files ("bin" or "txt") hold as many whole records as they say, and no more.
 
+    points3D.txt may be empty where no image refers to a point: so COLMAP's own guide has models of known cameras written.
+
     Raises:
         SceneError: one does not, or a needed file is missing; the message names the file and the record or line.
     """
+    points_told = False
     for part in ("cameras", "images", "points3D", "rigs", "frames"):
         file = folder / f"{part}.{suffix}"
         if not file.is_file():
@@ -36,8 +40,30 @@ def check_records(folder: Path, suffix: str) -> None:
             raise SceneError(f"sparse model {folder} has no {file.name}; {REMEDY}")
         if suffix == "bin":
             _check_binary(file, _BINARY[part])
+        elif part == "images":
+            points_told = _check_text(file, _TEXT[part], paired=True)
         else:
-            _check_text(file, _TEXT[part], paired=part == "images")
+            _check_text(file, _TEXT[part], may_be_empty=part == "points3D" and not points_told)
+
+
+def announced_images(folder: Path) -> int:
+    """How many images the model in a folder says that it has, by the first lines of its files; 0 where none says it."""
+    binary, text = folder / "images.bin", folder / "images.txt"
+    try:
+        if binary.is_file():
+            with binary.open("rb") as file:
+                return _COUNT.unpack(file.read(_COUNT.size))[0]
+        with text.open(encoding="utf-8", errors="replace") as file:
+            counts = (_announced(line) for line in takewhile(lambda line: line.startswith("#"), file))
+            return next((count for count in counts if count is not None), 0)
+    except (OSError, error):
+        return 0
+
+
+def _announced(line: str) -> int | None:
+    """The number of records that a comment in a text file tells, or None."""
+    word = line.partition(":")[2].partition(",")[0].strip()
+    return int(word) if line.startswith("# Number of ") and word.isdigit() else None
 
 
 def _check_binary(file: Path, end_of: Callable[[bytes, int], int]) -> None:
@@ -107,18 +133,22 @@ def _frame(data: bytes, at: int) -> int:
 _BINARY = {"cameras": _camera, "images": _image, "points3D": _point, "rigs": _rig, "frames": _frame}
 
 
-def _check_text(file: Path, wrong: Callable[[list[str]], str | None], paired: bool) -> None:
-    """``wrong`` says of the words of a record what is missing, or None; ``paired`` records have a line of points each."""
+def _check_text(
+    file: Path, wrong: Callable[[list[str]], str | None], paired: bool = False, may_be_empty: bool = False
+) -> bool:
+    """Whether an image refers to a point. ``wrong`` says of the words of a record what is missing, or None; ``paired`` records
+    have a line of points each."""
     text = file.read_text(encoding="utf-8", errors="replace")
     if not text.strip():
+        if may_be_empty:
+            return False
         raise SceneError(f"sparse model {file} is empty; {REMEDY}")
     lines = text.splitlines()
-    announced, found, number = None, 0, 0
+    announced, found, number, points_told = None, 0, 0, False
     while number < len(lines):
         line, number = lines[number].strip(), number + 1
         if line.startswith("# Number of "):
-            word = line.partition(":")[2].partition(",")[0].strip()
-            announced = int(word) if word.isdigit() else None
+            announced = _announced(line)
         if not line or line.startswith("#"):
             continue
         found += 1
@@ -131,12 +161,14 @@ def _check_text(file: Path, wrong: Callable[[list[str]], str | None], paired: bo
                 raise SceneError(
                     f"sparse model {file}, line {number}: points of an image are numbers X Y POINT3D_ID; {REMEDY}"
                 )
+            points_told |= any(word != "-1" for word in points[2::3])
     if announced is not None and (announced != found or not text.endswith("\n")):
         raise SceneError(
             f"sparse model {file} announces {announced} records and has {found}"
             + ("" if text.endswith("\n") else f", the last without the end of its line ({len(lines)})")
             + f"; {REMEDY}"
         )
+    return points_told
 
 
 def _numbers(words: list[str]) -> bool:

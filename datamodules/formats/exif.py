@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
 from typing import Any
 
 from PIL import Image
@@ -15,14 +17,14 @@ EXIF, GPS = 0x8769, 0x8825  # directories
 MAKE, MODEL, TAKEN, TAKEN_ZONE, THOUSANDTHS, FOCAL, SERIAL = 0x10F, 0x110, 0x9003, 0x9011, 0x9291, 0x920A, 0xA431
 
 
-def exif_in(data: bytes) -> dict[str, Any]:
-    """What the EXIF of a picture says; only what is there, and nothing for what is damaged or no picture.
+def exif_in(source: bytes | Path) -> dict[str, Any]:
+    """What the EXIF of a picture, or of the file of one, says; only what is there, and nothing for what is damaged or no picture.
 
     "make", "model", "serial", "focal_mm", "time" (with the zone where the file has one), "latitude_deg", "longitude_deg" and
     "altitude_m".
     """
     try:
-        with Image.open(io.BytesIO(data)) as picture:
+        with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source) as picture:
             whole = picture.getexif()
             taken, gps = whole.get_ifd(EXIF), whole.get_ifd(GPS)
             found = {"make": whole.get(MAKE), "model": whole.get(MODEL), "serial": taken.get(SERIAL)}
@@ -31,7 +33,7 @@ def exif_in(data: bytes) -> dict[str, Any]:
         return {}
     found = {key: text for key, value in found.items() if (text := _text(value)) is not None}
     readers = (
-        lambda: {"focal_mm": float(taken[FOCAL])} if FOCAL in taken else {},
+        lambda: {"focal_mm": _known(taken[FOCAL], above=0.0)} if FOCAL in taken else {},
         lambda: {"time": _time(taken, gps)},
         lambda: _position(gps),
     )
@@ -45,6 +47,12 @@ def exif_in(data: bytes) -> dict[str, Any]:
 
 def _text(value: Any) -> str | None:
     return str(value).replace("\0", "").strip() or None if value is not None else None
+
+
+def _known(value: Any, above: float = -math.inf) -> float | None:
+    """A number, None for 0/0 (with which cameras say that they do not know it) and for one that is not above the limit."""
+    number = float(value)
+    return number if math.isfinite(number) and number > above else None
 
 
 def _time(taken: dict[int, Any], gps: dict[int, Any]) -> datetime | None:
@@ -82,7 +90,6 @@ def _position(gps: dict[int, Any]) -> dict[str, float]:
     if not (abs(latitude) <= 90 and abs(longitude) <= 180) or latitude == longitude == 0:
         return {}
     found = {"latitude_deg": latitude, "longitude_deg": longitude}
-    if 6 in gps:
-        below = gps.get(5) in (1, b"\x01")
-        found["altitude_m"] = -float(gps[6]) if below else float(gps[6])
+    if 6 in gps and (height := _known(gps[6])) is not None:
+        found["altitude_m"] = -height if gps.get(5) in (1, b"\x01") else height
     return found

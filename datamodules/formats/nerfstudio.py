@@ -19,6 +19,8 @@ from heatsplat.geometry.transforms import OPENGL_AXES
 
 # nerfstudio has one OPENCV model for all polynomial lenses; FULL_OPENCV reads whatever of its coefficients are there.
 _COLMAP_NAME = {"OPENCV": "FULL_OPENCV", "PERSPECTIVE": "PINHOLE"}
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_OTHER_POLYNOMIAL = ("k4", "k5", "k6")  # nerfstudio's k4 is that of r^8, which OpenCV does not have; OpenCV's divides
 # Keys of a frame's images, in order of preference: the first of each is the data sets' own.
 THERMAL_KEYS = ("thermal_file_path", "thermal", "thermal_path", "ir", "infrared")
 VISIBLE_KEYS = ("file_path", "rgb", "rgb_file_path", "rgb_path", "image", "image_path", "color")
@@ -75,7 +77,7 @@ def _path_in(frame: dict[str, Any], keys: Sequence[str], used: set[str]) -> str 
             value = value.get("file_path")
         if isinstance(value, str) and value:
             used.add(key)
-            return value
+            return value.replace("\\", "/")  # as instant-ngp writes them on Windows
     return None
 
 
@@ -133,20 +135,29 @@ def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tu
         size: returns (width, height) of the stored image, asked only where the file does not give w and h.
 
     Raises:
-        SceneError: no focal length, or a camera model that is not supported.
+        SceneError: no focal length, a camera model that is not supported, or distortion that the model does not have.
     """
     values = {**transforms.values, **frame}
-    model = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")).upper()
-    model = _COLMAP_NAME.get(model, model)
+    said = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")).upper()
+    model = _COLMAP_NAME.get(said, said)
     source = f"{transforms.path}, {frame['file_path']}"
     if values.get("is_fisheye") and "FISHEYE" not in model:
-        raise SceneError(f"{source}: is_fisheye is true, but camera_model is {model}; keep one of them")
+        raise SceneError(f"{source}: is_fisheye is true, but camera_model is {said}; keep one of them")
     if model not in MODELS:
         lens_of(model, (), 0, 0, source)  # raises, naming the supported models
 
     def number(key: str, default: float = 0.0) -> float:
         return finite(values.get(key, default), f"{source}: {key}")
 
+    has = set(MODELS[model].split()) - set(_OTHER_POLYNOMIAL if said == "OPENCV" else ())
+    if beyond := next((key for key in _COEFFICIENTS if key not in has and values.get(key) and number(key)), None):
+        meant = "FULL_OPENCV" if beyond in _OTHER_POLYNOMIAL else "OPENCV"
+        meant = "OPENCV_FISHEYE" if "FISHEYE" in model else meant
+        raise SceneError(
+            f"{source}: {beyond} is {number(beyond):g}, and camera model {said} has no {beyond}; "
+            + ("" if meant == said else f"say camera_model {meant} if it is one of that, or ")
+            + f"undistort the images and take {beyond} out"
+        )
     width, height = (int(number("w")), int(number("h"))) if "w" in values and "h" in values else size()
     fx = _focal(values, "x", width, source)
     if fx is None:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.bounds import MAX_CELSIUS
 from heatsplat.datamodules.formats import dji, flir
 from heatsplat.datamodules.formats.images import read_image, tiff_text
 from heatsplat.datamodules.side_files import says_fahrenheit, says_kelvin
@@ -59,14 +60,17 @@ CELSIUS_OF_KELVIN = f"counts.offset_c={-KELVIN_AT_0_C:g}"
 
 
 def surface_celsius(stored: np.ndarray, calibration: Calibration, conditions: Conditions | None = None) -> np.ndarray:
-    """Temperatures in °C [H, W] float32 of stored numbers [H, W], each distinct number once; NaN where unknown.
+    """Temperatures in °C [H, W] float32 of stored numbers [H, W], each distinct number once; NaN where unknown, or hotter than
+    any camera reads, as the 3.4e38 is with which gdal_calc marks what it does not know.
 
     Args:
         conditions: one for the whole image; None for apparent temperatures.
     """
     values, where = np.unique(stored, return_inverse=True)
     kelvin = calibration.surface_k(torch.from_numpy(values.astype(np.float64)), conditions or Conditions())
-    return (kelvin.numpy() - KELVIN_AT_0_C).astype(np.float32)[where].reshape(stored.shape)
+    celsius = (kelvin.numpy() - KELVIN_AT_0_C).astype(np.float32)
+    celsius[celsius > MAX_CELSIUS] = np.nan
+    return celsius[where].reshape(stored.shape)
 
 
 def read_bytes(path: Path) -> bytes:

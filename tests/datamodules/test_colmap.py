@@ -249,6 +249,20 @@ def test_a_model_that_misses_a_file_names_it(tmp_path):
         read_model(tmp_path)
 
 
+def test_a_text_model_of_known_cameras_may_have_an_empty_file_of_points(tmp_path):
+    """As COLMAP's guide has them written: a line for each image, an empty one below it, and points3D.txt without content."""
+    folder = find_model(write_colmap(tmp_path, names(9), text=True))
+    lines = [line for line in (folder / "images.txt").read_text().splitlines() if line.rpartition(".")[2] == "png"]
+    (folder / "images.txt").write_text("".join(f"{line}\n\n" for line in lines))
+    (folder / "points3D.txt").write_text("")
+    scene = loaded(tmp_path, random_points=50)
+    assert len(scene.train) == 7 and len(scene.points) == 50
+    assert "the sparse model has none" in str(scene.notes)
+    (folder / "images.txt").write_text("".join(f"{line}\n3.5 4.5 -1 8.0 9.0 17\n" for line in lines))
+    with pytest.raises(SceneError, match=r"points3D.txt is empty; copy the model"):  # its images know points
+        read_model(tmp_path)
+
+
 def test_a_damaged_model_is_named(tmp_path):
     folder = find_model(write_colmap(tmp_path, names(9)))
     (folder / "images.bin").write_bytes((folder / "images.bin").read_bytes()[:60])

@@ -52,3 +52,12 @@ def test_a_clock_that_was_never_set_costs_nothing_else(clock):
     assert found.keys() == {"make", "model", "focal_mm", "latitude_deg", "longitude_deg", "altitude_m"}
     blank = exif_in(jpeg(TAKEN | {0x9011: "   :  "}, GPS))["time"]
     assert blank == datetime(2024, 10, 21, 13, 48, 48, 876000)
+
+
+def test_numbers_that_cameras_do_not_know_say_nothing():
+    """EXIF has 0/0 for what is unknown, and a focal length of 0 for a lens that is."""
+    unknown = IFDRational(0, 0)
+    found = exif_in(jpeg(TAKEN | {0x920A: unknown}, GPS | {6: unknown}))
+    assert "focal_mm" not in found and "altitude_m" not in found and found["latitude_deg"] < 0
+    assert "focal_mm" not in exif_in(jpeg(TAKEN | {0x920A: IFDRational(0, 10)}, {}))
+    assert exif_in(jpeg(TAKEN, GPS | {5: b"\x01"}))["altitude_m"] == pytest.approx(-394.2)

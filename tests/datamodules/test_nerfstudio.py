@@ -11,6 +11,7 @@ from layouts import FOCAL, HEIGHT, WIDTH, grey, names, opengl, viewmats, write_c
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in
 from heatsplat.datamodules.nerfstudio import Nerfstudio
 
 LENS = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 20.0, "cy": 16.0, "w": WIDTH, "h": HEIGHT}
@@ -134,6 +135,14 @@ def test_fields_of_view_tell_both_focal_lengths(tmp_path):
         assert [float(K[0, 0]), float(K[1, 1])] == pytest.approx([fx, fy]), given
 
 
+def test_paths_of_windows_are_paths(tmp_path):
+    """colmap2nerf of instant-ngp writes the folder of the images as the system does."""
+    for i in range(9):
+        write_image(tmp_path / "ir" / "day" / f"{i}.png", grey(i))
+    write_frames(tmp_path, [{"file_path": f".\\ir\\day/{i}.png"} for i in range(9)])
+    assert len(loaded(tmp_path).train) == 7
+
+
 def test_a_fisheye_of_instant_ngp_is_one(tmp_path):
     """Its files name no camera model, only is_fisheye: the same k1 to k4 are those of another lens."""
     coefficients = {"k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": -0.001}
@@ -146,8 +155,34 @@ def test_a_fisheye_of_instant_ngp_is_one(tmp_path):
         ngp.train[0].camera.K, named.train[0].camera.K
     )
     write_frames(tmp_path / "ngp", [{"file_path": "0.png"}], is_fisheye=True, camera_model="OPENCV")
-    with pytest.raises(SceneError, match="is_fisheye is true, but camera_model is FULL_OPENCV; keep one of them"):
+    with pytest.raises(SceneError, match="is_fisheye is true, but camera_model is OPENCV; keep one of them"):
         loaded(tmp_path / "ngp")
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (
+            {"camera_model": "OPENCV", "k4": 0.1},
+            "k4 is 0.1, and camera model OPENCV has no k4; say camera_model FULL_OPENCV",
+        ),
+        ({"k4": 0.1}, "camera model OPENCV has no k4"),
+        (
+            {"camera_model": "PINHOLE", "k1": -0.2, "k2": None},
+            "k1 is -0.2, .* PINHOLE has no k1; say camera_model OPENCV",
+        ),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.01}, "camera model OPENCV_FISHEYE has no p1; undistort"),
+    ],
+)
+def test_distortion_that_the_camera_model_does_not_have_is_refused(tmp_path, values, said):
+    """nerfstudio's k4 is the factor of r^8, OpenCV's divides by 1 + k4 r^2: nerfstudio undistorts no image with it, either."""
+    lens = {"fl_x": 50.0, "w": WIDTH, "h": HEIGHT}
+    with pytest.raises(SceneError, match=said):
+        lens_in(Transforms(tmp_path, lens | values, []), {"file_path": "0.png"}, lambda: (WIDTH, HEIGHT))
+    named = lens_in(
+        Transforms(tmp_path, lens, []), {"file_path": "0.png", "camera_model": "FULL_OPENCV", "k4": 0.1}, None
+    )
+    assert named.distortion == (0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0)
 
 
 def test_a_folder_thermal_with_cameras_of_its_own(tmp_path):

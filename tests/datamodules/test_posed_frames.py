@@ -32,6 +32,22 @@ def test_images_and_models_that_differ_are_matched_and_noted(tmp_path, caplog):
     assert scene.notes["images_unregistered"].startswith("1 file not in the model, unused: extra.png")
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_a_larger_model_beside_is_told(tmp_path, caplog, text):
+    """COLMAP numbers models that do not connect in the order in which it began them: sparse/0 need not be the largest."""
+    write_colmap(tmp_path, names(12), text=text, place="sparse/1")
+    write_colmap(tmp_path, names(4), text=text, images=None, place="sparse/0")
+    (tmp_path / "sparse" / "2").mkdir()
+    (tmp_path / "sparse" / "2" / "images.bin").write_bytes(b"cut")
+    scene = loaded(tmp_path)
+    assert scene.notes["registered"] == 4 and scene.notes["larger_model"] == "4 images, and 1 beside it has 12"
+    told = "sparse/0 has 4 images, and 1 beside it has 12: put that model in its place to train on those"
+    assert caplog.records[0].getMessage() == f"{tmp_path}/{told}"
+    (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "3")
+    (tmp_path / "sparse" / "1").rename(tmp_path / "sparse" / "0")
+    assert "larger_model" not in loaded(tmp_path).notes
+
+
 def test_a_model_without_any_of_the_images_shows_both_names(tmp_path):
     write_colmap(tmp_path, names(9), images=None)
     write_image(tmp_path / "images" / "other.png", grey(0))

@@ -56,6 +56,21 @@ def test_a_model_of_the_camera_s_files_becomes_that_of_the_prepared_images(tmp_p
     assert "4 of 5 frames have a camera" in said
 
 
+@pytest.mark.parametrize("place", ["sparse/1", "exported", "sparse"])
+def test_the_folder_of_a_model_may_be_called_anything(tmp_path, place):
+    """COLMAP exports a model into any folder, and the larger one may be sparse/1."""
+    source = write_flir(tmp_path / "files", 3)
+    points = np.zeros((4, 3)), np.zeros((4, 3))
+    own = tmp_path / "tool" / place
+    write_model(
+        own if place != "sparse" else own / "0", {f"IR_{i:04d}.jpg": pose(i) for i in range(3)}, [FISHEYE], *points
+    )
+    if place == "sparse/1":
+        write_model(tmp_path / "tool" / "sparse" / "0", {"IR_0000.jpg": pose(0)}, [FISHEYE], *points)
+    page = prepare(str(source), tmp_path / "scene", **PLAIN, poses=GivenPoses(str(own)))
+    assert "3 of 3 frames have a camera" in page.read_text()
+
+
 def test_a_transforms_file_without_points_trains_from_random_ones_which_nothing_is_judged_by(tmp_path):
     source = write_flir(tmp_path / "files", 9)
     turned = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -13,12 +13,13 @@ import torch
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.colmap import read_model
+from heatsplat.datamodules.formats.colmap_library import pycolmap
 from heatsplat.datamodules.synthetic_scene.camera_folder import Field, flight, write_camera
 from heatsplat.datamodules.synthetic_scene.film import Size
 from heatsplat.geometry.alignment import pose_errors
 from heatsplat.preparation.conditions import GivenConditions
 from heatsplat.preparation.features import Sift
-from heatsplat.preparation.frame import Position, ThermalFrame
+from heatsplat.preparation.frame import CameraInfo, Position, ThermalFrame
 from heatsplat.preparation.frames import Reading, read_recording
 from heatsplat.preparation.poses import FindPoses, Search
 
@@ -90,6 +91,44 @@ def test_a_search_goes_on_and_begins_anew_where_frames_or_settings_have_changed(
     assert stays(FindPoses(Sift()), emissivity=0.9, reflected_c=-20.0)
     (tmp_path / "f002.tif").write_bytes(b"another recording")
     assert not stays(FindPoses(Sift())) and stays(FindPoses(Sift()))
+
+
+def test_focal_lengths_are_told_by_one_frame_of_a_camera(tmp_path):
+    """A field of view needs the width of an image: read for each frame that would be the whole recording."""
+    loaded = []
+
+    def load() -> np.ndarray:
+        loaded.append(True)
+        return np.zeros((4, 8), np.float32)
+
+    wide = CameraInfo(field_of_view_deg=90.0)
+    frames = [replace(frame, camera=wide, load=load) for frame in search_of(tmp_path, 6).frames.values()]
+    search = Search(FindPoses(Sift()), frames, tmp_path)
+    camera = SimpleNamespace(params=[1.0, 4.0, 2.0], focal_length_idxs=lambda: [0], has_prior_focal_length=False)
+    database = SimpleNamespace(
+        read_all_images=lambda: [SimpleNamespace(name=copy, camera_id=1) for copy in search.name_of],
+        read_camera=lambda number: camera,
+        update_camera=lambda changed: None,
+    )
+    search._set_focal_lengths(database)
+    assert camera.params == [pytest.approx(4.0), 4.0, 2.0] and camera.has_prior_focal_length
+    assert len(loaded) == 1
+
+
+def test_the_database_is_asked_for_a_camera_until_it_has_one(tmp_path, monkeypatch):
+    """It lists all of its images each time: asked for every frame, that is their square."""
+    search, asked = search_of(tmp_path, 6), []
+    rng = np.random.default_rng(0)
+    for copy in search.name_of:
+        (search.work / "images" / copy).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(search.work / "images" / copy), rng.integers(0, 255, (48, 64)).astype(np.uint8))
+    own = Search._camera_of
+    monkeypatch.setattr(Search, "_camera_of", lambda *given: asked.append(given) or own(*given))
+    search.find_features()
+    assert len(asked) == 2  # the first image has none yet
+    with pycolmap.Database.open(search.database) as database:
+        images = database.read_all_images()
+    assert len(images) == 6 and len({image.camera_id for image in images}) == 1
 
 
 def test_gps_counts_where_it_tells_frames_apart(tmp_path):

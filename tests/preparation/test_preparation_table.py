@@ -104,3 +104,20 @@ def test_a_column_that_completes_nothing_is_refused(tmp_path, head, said):
     (tmp_path / "table.csv").write_text(f"file,{head}\na,1,2\n")
     with pytest.raises(SceneError, match=said):
         read_frames(tmp_path / "files", Reading(table=tmp_path / "table.csv", columns=PLACED))
+
+
+@pytest.mark.parametrize(
+    ("cells", "said"),
+    [
+        ("nan,8", "line 2: 'nan' in column lat is no number; leave cells empty"),
+        ("50,inf", "line 2: 'inf' in column lon is no number"),
+        ("150,8", "line 2: '150' in column lat is no latitude, which lies between -90 and 90 degrees"),
+        ("50,-190", "column lon is no longitude, .* -180 and 180"),
+        ("0,0", "line 2: latitude and longitude are 0, as GPS without a fix .* leave both cells empty"),
+    ],
+)
+def test_places_that_cannot_be_are_refused_by_their_line(tmp_path, cells, said):
+    write_images(tmp_path / "files", {"a.tiff": FLOATS})
+    (tmp_path / "table.csv").write_text(f"file,lat,lon\na,{cells}\n")
+    with pytest.raises(SceneError, match=said):
+        read_frames(tmp_path / "files", Reading(table=tmp_path / "table.csv", columns=PLACED))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_files import temperatures
 from commands import succeeds
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from recordings import read_frames, write_flir, write_images, write_sequence
@@ -52,6 +53,19 @@ def test_the_command_that_trains_can_be_typed_as_it_is_shown(tmp_path, caplog, n
     assert f"python src/train.py data=colmap {word}\n" in caplog.text
     (override,) = OverridesParser.create().parse_overrides(shlex.split(word))
     assert override.value() == str(tmp_path / name)
+
+
+def test_marks_of_what_is_not_known_are_no_temperatures(tmp_path):
+    """gdal_calc writes the largest float for what it does not know, others the smallest or infinity: no bounds hold those."""
+    known = temperatures().astype(np.float32)
+    images = {f"f{i}.tiff": known + i for i in range(9)}
+    for image in images.values():
+        image[3, 2:6] = 3.402823466e38, -3.402823466e38, np.inf, np.nan
+    prepare(str(write_images(tmp_path / "files", images)), tmp_path / "scene", **PLAIN, poses=poses)
+    written = read_temperature(tmp_path / "scene" / "images" / "f4.tiff")
+    assert np.isnan(written[3, 2:6]).all() and np.isfinite(written).sum() == written.size - 4
+    bounds = Colmap(root=str(tmp_path / "scene")).scene.thermal_range
+    assert (bounds.min_c, bounds.max_c) == pytest.approx((known.min(), known.max() + 8), abs=1e-4)
 
 
 def test_a_folder_of_camera_files_becomes_a_scene_that_loads_with_temperatures_and_times(tmp_path):
