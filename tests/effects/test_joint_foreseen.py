@@ -47,6 +47,12 @@ def test_what_is_not_in_doubt_is_not_taken_for_heat():
     assert not holds_still(fit, Model.of(frame_offset=1), {"frame_offset"})
 
 
+@pytest.mark.parametrize("times", [None, torch.zeros(FRAMES, dtype=torch.float64)])
+def test_images_without_times_do_not_say_that_a_scene_holds_still(times):
+    fit = fit_of(replace(data_of(jumping(0.04)), times_s=times))
+    assert holds_still(fit, GAINS, {"agc"}) is False
+
+
 def test_images_too_few_to_follow_a_scene_do_not_say_that_it_holds_still():
     data = data_of(jumping(0.04))
     often = torch.ones_like(data.tracks.weights)

@@ -38,11 +38,15 @@ def foreseen(fit: Fit, values: Tensor, count: int) -> HeldOut:
 def holds_still(fit: Fit, model: Model, doubts: Collection[str]) -> bool:
     """Whether no course over time foresees images, though one as large as the error expected of an observation would.
 
+    Of images without times, or of one moment, none lies between others, and nobody can say so.
+
     Args:
         fit: linearised about the model.
         model: of what images show.
         doubts: effects by name that may not be there; what they explain is left to the courses.
     """
+    if not fit.data.span_s:
+        return False
     added = fit.contributions(model)
     values = fit.data.tracks.values - sum(part for name, part in added.items() if name not in doubts)
     if _goes_on(fit, values):
