@@ -136,8 +136,17 @@ _BINARY = {"cameras": _camera, "images": _image, "points3D": _point, "rigs": _ri
 def _check_text(
     file: Path, wrong: Callable[[list[str]], str | None], paired: bool = False, may_be_empty: bool = False
 ) -> bool:
-    """Whether an image refers to a point. ``wrong`` says of the words of a record what is missing, or None; ``paired`` records
-    have a line of points each."""
+    """Whether a line of points refers to one.
+
+    Args:
+        file: of one part of a model.
+        wrong: says of the words of a record what is missing, or None.
+        paired: records have a line of points each, as those of images.
+        may_be_empty: a file without anything is whole.
+
+    Raises:
+        SceneError: a record or line is not whole, or there are not as many as the file says.
+    """
     text = file.read_text(encoding="utf-8", errors="replace")
     if not text.strip():
         if may_be_empty:

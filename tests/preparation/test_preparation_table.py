@@ -91,6 +91,13 @@ def test_a_column_of_a_table_replaces_its_own_value_and_no_other(tmp_path):
     assert "table.csv tells above_takeoff_m, altitude_m of 2 of 2 frames" in found.notes
 
 
+def placed_by(folder, table):
+    """The frames of one image a.tiff with a table of this text."""
+    write_images(folder / "files", {"a.tiff": FLOATS})
+    (folder / "table.csv").write_text(table)
+    return read_frames(folder / "files", Reading(table=folder / "table.csv", columns=PLACED))
+
+
 @pytest.mark.parametrize(
     ("head", "said"),
     [
@@ -100,10 +107,8 @@ def test_a_column_of_a_table_replaces_its_own_value_and_no_other(tmp_path):
     ],
 )
 def test_a_column_that_completes_nothing_is_refused(tmp_path, head, said):
-    write_images(tmp_path / "files", {"a.tiff": FLOATS})
-    (tmp_path / "table.csv").write_text(f"file,{head}\na,1,2\n")
     with pytest.raises(SceneError, match=said):
-        read_frames(tmp_path / "files", Reading(table=tmp_path / "table.csv", columns=PLACED))
+        placed_by(tmp_path, f"file,{head}\na,1,2\n")
 
 
 @pytest.mark.parametrize(
@@ -117,7 +122,5 @@ def test_a_column_that_completes_nothing_is_refused(tmp_path, head, said):
     ],
 )
 def test_places_that_cannot_be_are_refused_by_their_line(tmp_path, cells, said):
-    write_images(tmp_path / "files", {"a.tiff": FLOATS})
-    (tmp_path / "table.csv").write_text(f"file,lat,lon\na,{cells}\n")
     with pytest.raises(SceneError, match=said):
-        read_frames(tmp_path / "files", Reading(table=tmp_path / "table.csv", columns=PLACED))
+        placed_by(tmp_path, f"file,lat,lon\na,{cells}\n")
