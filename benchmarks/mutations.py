@@ -6,16 +6,9 @@ own, split off from a server that has the libraries loaded and no threads (so it
 
 from __future__ import annotations
 
-import contextlib
-import importlib.abc
-import importlib.machinery
-import io
 import logging
 import multiprocessing
-import os
 import shlex
-import sys
-import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -30,7 +23,6 @@ from heatsplat.studies.options import subset_of
 log = logging.getLogger("heatsplat")
 
 ROOT = Path(__file__).resolve().parents[1]
-LIBRARIES = ("hypothesis", "mpmath", "pytest", "scipy.spatial", "torch")  # that mutants need and none changes
 FAULTS = ROOT / "tests" / "faults.yaml"  # one-line faults in all parts
 SURVIVED = "**no test noticed**"
 HEAD = """# Mutations: do the tests notice?
@@ -232,10 +224,10 @@ def run(
     chosen = [mutation for mutation in MUTATIONS if mutation.name in wanted]
     # A child of this process would inherit OpenMP threads that do not run in it, and die of its first parallel kernel.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(LIBRARIES))
+    context.set_forkserver_preload(["benchmarks.mutants"])
     noticed: dict[str, str | None] = {}
     with ProcessPoolExecutor(processes, context, max_tasks_per_child=1) as pool:
-        for mutation, test in zip(chosen, pool.map(first_failure, chosen), strict=True):
+        for mutation, test in zip(chosen, pool.map(_noticing, chosen), strict=True):
             noticed[mutation.name] = test
             log.info("%s: %s", mutation.name, test or "no test noticed")
     text = written(chosen, noticed)
@@ -262,59 +254,11 @@ def _readable(test: str | None) -> str:
     return SURVIVED if test is None else f"`{test.split('[')[0]}`"
 
 
-def first_failure(mutation: Mutation) -> str | None:
-    """The first test that fails under a mutation, run in this process, which is of no other use afterwards."""
-    import pytest
-    import torch
+def _noticing(mutation: Mutation) -> str | None:
+    """The test that notices it, in a process of its own."""
+    from benchmarks.mutants import first_failure  # which loads all libraries
 
-    torch.set_num_threads(1)
-    sys.meta_path.insert(0, _Finder(f"heatsplat.{mutation.module}", mutation.source()))
-    for name in [name for name in sys.modules if name.split(".")[0] == "heatsplat"]:
-        if name != __name__:
-            del sys.modules[name]
-    words = shlex.split(mutation.tests)
-    recorder = _Recorder()
-    with contextlib.ExitStack() as stack:
-        for stream in (contextlib.redirect_stdout, contextlib.redirect_stderr):
-            stack.enter_context(stream(io.StringIO()))
-        if mutation.module.startswith("kernels."):
-            # Compiled code is kept by the content of files, which does not change: neither may take the other's.
-            os.environ["NUMBA_CACHE_DIR"] = stack.enter_context(tempfile.TemporaryDirectory())
-        options = ["-x", "-q", "-p", "no:cacheprovider", f"--rootdir={ROOT}", "-c", str(ROOT / "pyproject.toml")]
-        code = pytest.main([*(str(ROOT / w) if w.startswith("tests/") else w for w in words), *options], [recorder])
-    if code not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
-        raise RuntimeError(f"the tests of mutation '{mutation.name}' could not be run ({code}): {mutation.tests}")
-    return recorder.failed
-
-
-class _Recorder:
-    """Remembers the first test that failed."""
-
-    failed: str | None = None
-
-    def pytest_runtest_logreport(self, report) -> None:
-        if report.failed and self.failed is None:
-            self.failed = report.nodeid
-
-
-class _Finder(importlib.abc.MetaPathFinder):
-    """Finds one module as usual and loads another source for it, past all caches of bytecode."""
-
-    def __init__(self, name: str, source: str) -> None:
-        self.name, self.source = name, source
-
-    def find_spec(self, name: str, path=None, target=None):
-        if name != self.name:
-            return None
-        spec = importlib.machinery.PathFinder.find_spec(name, path)
-        spec.loader = _Loader(name, spec.origin, self.source)
-        return spec
-
-
-class _Loader(importlib.machinery.SourceFileLoader):
-    def __init__(self, name: str, path: str, source: str) -> None:
-        super().__init__(name, path)
-        self.mutated = source
-
-    def get_code(self, fullname: str):
-        return compile(self.mutated, self.path, "exec", dont_inherit=True)
+    try:
+        return first_failure(f"heatsplat.{mutation.module}", mutation.source(), shlex.split(mutation.tests))
+    except ValueError as error:
+        raise RuntimeError(f"the tests of mutation '{mutation.name}' could not be run: {error}") from error
