@@ -285,10 +285,10 @@ def test_a_checkpoint_goes_on_with_the_settings_that_it_was_trained_with(trained
 
 
 def test_a_checkpoint_goes_on_for_longer_with_all_that_follows_from_the_length(trained):
-    """Not steps alone: of 8 steps an update takes 1 view, of 2000 it takes 5."""
+    """Not steps alone: of 8 steps an update takes 1 view, of 2000 it takes 2."""
     folder, config, _ = trained
     longer = went_on(folder, "max_steps=2000", "doctor=true", "renderer=cpu")
-    assert longer["ckpt"] and longer["optim"]["accumulate"] == 5 * config["optim"]["accumulate"]
+    assert longer["ckpt"] and longer["optim"]["accumulate"] == 2 * config["optim"]["accumulate"]
 
 
 def test_a_checkpoint_of_the_last_step_or_a_later_one_is_refused_before_a_run_that_trains_nothing(trained):

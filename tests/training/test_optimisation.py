@@ -152,8 +152,8 @@ def test_gradients_of_several_views_wait_for_one_update():
         Optimisation(accumulate=0)
 
 
-@pytest.mark.parametrize(("steps", "views"), [(20, 1), (300, 1), (650, 2), (1500, 4), (2000, 5), (5000, 8), (30000, 8)])
-def test_longer_runs_sum_the_gradients_of_more_views(steps, views):
+@pytest.mark.parametrize(("steps", "views"), [(20, 1), (1000, 1), (1499, 1), (1500, 2), (30000, 2)])
+def test_two_views_share_an_update_in_runs_that_are_not_short(steps, views):
     ours, papers = (composition.compose([f"max_steps={steps}", *recipe]) for recipe in ([], ["recipe=published"]))
     assert composition.build(ours["optim"]).accumulate == views
     assert composition.build(papers["optim"]).accumulate == 1
