@@ -131,7 +131,7 @@ def test_images_of_another_weather_tell_nothing():
 
 
 def test_intervals_hold_the_truth_and_grow_where_no_camera_looked(tmp_path, monkeypatch, caplog):
-    settings = ("method=3dgs", "data.scene=static", "max_steps=300", *BARE)
+    settings = ("method=3dgs", "data.scene=static", "max_steps=150", *BARE)
     module, trainer = run(tmp_path, *settings)
     told = Uncertainty(module)
     clean = build({**module.config["data"], "noise_k": 0.0}).scene

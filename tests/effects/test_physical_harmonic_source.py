@@ -20,7 +20,7 @@ def inspected(name, **recorded):
 
 @pytest.fixture(scope="module")
 def heated():
-    return inspected("heated", size="tiny", frames=40)
+    return inspected("heated", size="tiny", frames=24)
 
 
 def test_a_lamp_gives_all_points_one_course_which_is_its_own(heated):

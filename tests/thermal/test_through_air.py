@@ -35,7 +35,7 @@ def test_an_unknown_way_to_clip_is_refused():
 
 
 def test_a_run_finds_the_extinction_of_the_fog(tmp_path):
-    module, _ = run(tmp_path, *BARE, "method=through_air", "data.scene=fog", "max_steps=600", "sensor=none")
+    module, _ = run(tmp_path, *BARE, "method=through_air", "data.scene=fog", "max_steps=450", "sensor=none")
     extinction = module.thermal.air.extinction().item()
     assert extinction == pytest.approx(droplets(2.0), rel=0.25)
     points, _ = module.scene.probes[:, :3], module.scene.probes

@@ -80,7 +80,7 @@ def test_the_floor_of_a_street_sees_the_sky_that_geometry_leaves_it(width, heigh
 
 def test_the_yard_is_lit_as_rays_say(monkeypatch):
     """Of a yard's points, against its boxes by ray tracing: shadows that are found outweigh those that are not there."""
-    scene, world = Synthetic(scene="outdoor", size="demo", frames=18).scene, OutdoorScene(OUTDOOR["outdoor"])
+    scene, world = Synthetic(scene="outdoor", size="demo", frames=8).scene, OutdoorScene(OUTDOOR["outdoor"])
     normals, exposure = Normals(views=12), Exposure(side=192)
     normals.prepare(scene, Renderer("cpu"), scene.points)
     exposure.prepare(scene, Renderer("cpu"), normals.discs, ["sun_seen"])

@@ -17,6 +17,7 @@ def trained(tmp_path_factory):
         "method=energy_balance",
         "data.downscale=2",
         "thermal.shadows=true",
+        "thermal.albedo=0.3",  # as other tests of shadows have it, which share its kernels
         "init.count=100",
         "exposure.side=32",
         "normals.views=4",
