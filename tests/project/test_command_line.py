@@ -22,7 +22,7 @@ from commands import succeeds
 from hydra._internal.utils import get_args_parser
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
-from running import NO_PICTURES
+from running import LOOKS, NO_PICTURES
 
 from heatsplat import cli, composition
 from heatsplat.contracts import SceneError
@@ -30,7 +30,7 @@ from heatsplat.runs.lock import OccupiedError
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = (
-    "data.size=tiny", "max_steps=20", "callbacks.probes.times=4", "callbacks.costs.fps_repeats=1",
+    "data.size=tiny", "max_steps=20", LOOKS, "callbacks.probes.times=4", "callbacks.costs.fps_repeats=1",
     "callbacks.turntable.frames=4", "callbacks.surfaces.views=4", "callbacks.viewer.cameras=4",
 )  # fmt: skip
 

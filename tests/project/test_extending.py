@@ -63,7 +63,14 @@ def results(copy, recording) -> Callable[[str], dict]:
     given[OWN_DATA] = OWN_DATA.format(recording).split()[1:]
     runs = {command: copy / "runs" / f"{number}" for number, command in enumerate(given)}
     words = [
-        [*given[command], *quick, "max_steps=30", "doctor=false", f"hydra.run.dir={run}"]
+        [
+            *given[command],
+            *quick,
+            "max_steps=30",
+            "trainer.val_check_interval=30",
+            "doctor=false",
+            f"hydra.run.dir={run}",
+        ]
         for command, run in runs.items()
     ]
     ended = dict(zip(given, in_turn(words, copy), strict=True))

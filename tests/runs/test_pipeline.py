@@ -71,7 +71,7 @@ def test_pictures_of_rendered_images_are_not_called_recorded(trained, monkeypatc
 
 
 def test_visible_images_are_no_temperatures(tmp_path):
-    colours = ("data.scene=glass", "thermal.modality=rgb", "thermal.channels=3", "test=false")
+    colours = ("data.scene=glass", "thermal.modality=rgb", "thermal.channels=3", "density=fixed", "test=false")
     config = heatsplat.compose([*QUICK, *colours])
     heatsplat.train(config, tmp_path)
     scene = heatsplat.load(tmp_path / "checkpoints" / "last.ckpt")

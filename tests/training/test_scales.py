@@ -106,7 +106,7 @@ def test_a_run_without_wind_is_looked_at_under_a_record_that_has_gained_it(tmp_p
     trained = load(tmp_path / "still.ckpt")  # with the record as it is now
     frame = module.scene.test.frames[0]
     assert trained.scene.weather.wind_m_s is not None and "raw_wind" not in trained.module.splats
-    seen, expected = (one.render(frame).features for one in (trained.module, module))  # with derivatives, as it was trained
+    seen, expected = (one.render(frame).features for one in (trained.module, module))  # with derivatives, as trained
     assert torch.equal(seen, expected) and expected.std() > 0
     assert "none in training" in trained.module.thermal.effects()["convection"]["left_out"]
     assert Composed(EnergyBalance(clip="none")).optional == {"raw_wind"}
@@ -122,7 +122,7 @@ def test_a_run_without_sunlight_says_what_to_do_under_a_record_that_has_gained_i
 
     with monkeypatch.context() as filming:
         filming.setattr(Synthetic, "load", dark)
-        settings = (*BARE, "method=energy_balance", "thermal.solution=linear")  # which needs no kernel of a balance in the dark
+        settings = (*BARE, "method=energy_balance", "thermal.solution=linear")  # the other has a kernel for the dark
         _, trainer = run(tmp_path, *settings, "max_steps=3", "trainer.max_steps=0")
         trainer.save_checkpoint(tmp_path / "dark.ckpt")
     with pytest.raises(

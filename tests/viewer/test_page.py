@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from running import run
+from running import LOOKS, run
 from viewer.browser import open_browser, opened, wait_until
 from viewer.test_payload import in_units
 
@@ -29,7 +29,7 @@ ActionChains = pytest.importorskip(
 ROOT = Path(__file__).parents[2]
 TINY = (
     "data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "callbacks.costs.fps_repeats=1",
-    "callbacks.surfaces.views=4", "callbacks.turntable.frames=3", "doctor=false", "threads=1", "optim.length_power=0",
+    "callbacks.surfaces.views=4", "callbacks.turntable.frames=3", "doctor=false", "threads=1", "optim.length_power=0", LOOKS,
 )  # fmt: skip
 USUAL = (800, 560)  # size of the window
 SETTINGS = ("method=etgs", "max_steps=120", "thermal.frequencies=6")
