@@ -17,7 +17,8 @@ from heatsplat.io.files import write_atomically
 NO_PICTURES = ("callbacks.surfaces=null", "callbacks.turntable=null", "callbacks.report.html=false")
 LOOKS = "trainer.val_check_interval=${steps:0.5,1}"  # at validation views: twice instead of ten times
 TINY = (
-    "data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "callbacks.viewer=null", *NO_PICTURES, LOOKS, "threads=1",
+    "data.size=tiny", "callbacks.probes=null", "callbacks.images=null", "callbacks.viewer=null", *NO_PICTURES,
+    "trainer.val_check_interval=${max_steps}", "threads=1",
 )  # fmt: skip
 # Training alone, for tests that look at the trained module: nothing is measured or logged; and nothing is stored.
 QUIET = (

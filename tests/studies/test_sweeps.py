@@ -333,7 +333,8 @@ def test_a_sweep_runs_all_rows_survives_a_failure_and_goes_on_where_it_stopped(t
     command = [
         TRAIN, "-m", "method=etgs", "data.size=tiny", "data.downscale=2",
         "max_steps=4", "trainer.val_check_interval=4", "seed=0", "threads=1", "callbacks.images=null", "callbacks.probes=null",
-        "callbacks.viewer=null", *NO_PICTURES, "doctor=false", f"hydra.sweeper.rows={rows}",
+        "callbacks.viewer=null", "callbacks.dashboard=null", "callbacks.statistics=null", "callbacks.attributes=null",
+        "callbacks.costs.fps_repeats=1", *NO_PICTURES, "doctor=false", f"hydra.sweeper.rows={rows}",
         "hydra.sweeper.paper={of:etgs,table:'4',scenes:[average]}",
         f"hydra.sweep.dir={tmp_path}/sweep",
     ]  # fmt: skip
