@@ -56,7 +56,7 @@ def test_the_ball_touches_nothing_on_its_way():
 
 
 def test_it_is_seen_where_nothing_hides_it_and_is_as_hot_as_the_camera_can_say():
-    recording = film(Scene(PRESET), Size(80, 64, 6, 50), noise_k=0.0)
+    recording = film(Scene(PRESET), Size(80, 64, 4, 50), noise_k=0.0)
     seen = [int((image > 399.0).sum()) for image in recording.exact]
     assert max(seen) > 12 and (recording.thermal_range.min_c, recording.thermal_range.max_c) == PRESET.bounds_c
     frame = int(np.argmax(seen))
