@@ -23,7 +23,17 @@ HALF = 0.3  # of a semi-axis: how far the halves of a split Gaussian are from it
 def untrained(tmp_path, *overrides):
     """The module of a run before its first step, with its scene."""
     run = begin(
-        compose([*TINY, "data.scene=cooling", "data.downscale=2", "data.frames=9", "init.count=200", "max_steps=10", *overrides]),
+        compose(
+            [
+                *TINY,
+                "data.scene=cooling",
+                "data.downscale=2",
+                "data.frames=9",
+                "init.count=200",
+                "max_steps=10",
+                *overrides,
+            ]
+        ),
         tmp_path,
     )
     run.data.setup("fit")

@@ -59,20 +59,12 @@ def recording(tmp_path_factory) -> Path:
 def results(copy, recording) -> Callable[[str], dict]:
     """Of a command the results of its run, of which the files are left out that no test looks at."""
     tiny, *quick = TINY
+    quick += ["max_steps=30", "trainer.val_check_interval=30", "doctor=false", "callbacks.costs.fps_repeats=1"]
+    quick += ["callbacks.dashboard=null", "callbacks.attributes=null"]
     given = {command: [*command.split()[1:], tiny] for command in COMMANDS}
     given[OWN_DATA] = OWN_DATA.format(recording).split()[1:]
     runs = {command: copy / "runs" / f"{number}" for number, command in enumerate(given)}
-    words = [
-        [
-            *given[command],
-            *quick,
-            "max_steps=30",
-            "trainer.val_check_interval=30",
-            "doctor=false",
-            f"hydra.run.dir={run}",
-        ]
-        for command, run in runs.items()
-    ]
+    words = [[*given[command], *quick, f"hydra.run.dir={run}"] for command, run in runs.items()]
     ended = dict(zip(given, in_turn(words, copy), strict=True))
 
     def of(command):
