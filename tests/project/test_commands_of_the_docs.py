@@ -83,7 +83,7 @@ def test_their_overrides_can_be_read():
             wrong.append(f"{name}: {error}")
         else:
             wrong += [name] * (len(read) != len(words))
-    assert wrong == []
+    assert not wrong, "\n".join(wrong)
 
 
 @pytest.mark.slow
