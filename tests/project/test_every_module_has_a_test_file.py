@@ -55,7 +55,7 @@ ELSEWHERE = {
     "sensors/test_supirgs_sensor": "sensors/agc sensors/base sensors/calibration sensors/tone",
     "studies/test_frontier_study": "studies/frontier/report studies/frontier/runs",
     "studies/test_reproduction": "studies/published/comparison studies/published/sources",
-    "studies/test_sweeps": "studies/finished studies/recorded",
+    "studies/test_sweeps": "io/recorded studies/finished",
     "thermal/test_composed": (
         "thermal/attenuation thermal/conduction thermal/part thermal/reflection thermal/view_dependence"
     ),

@@ -1,5 +1,6 @@
 """One process in a run's folder at a time, on every system."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -37,3 +38,13 @@ def test_a_system_without_file_locks_keeps_nobody_out(tmp_path, monkeypatch):
     monkeypatch.setattr(lock, "fcntl", None)
     with locked(tmp_path), locked(tmp_path):
         assert not (tmp_path / LOCK_FILE).exists()
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
+def test_a_disk_without_locks_is_told_and_keeps_nobody_out(tmp_path, monkeypatch, caplog, number):
+    def flock(file, operation):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(lock.fcntl, "flock", flock)
+    with locked(tmp_path):
+        assert f"{tmp_path} has no locks ({os.strerror(number)})" in caplog.text

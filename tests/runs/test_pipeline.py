@@ -1,6 +1,7 @@
 """The steps that make a run's configuration ready, and the Python interface around them."""
 
 import math
+import os
 import shutil
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from running import TINY
 import heatsplat
 from heatsplat.composition import build, run_of
 from heatsplat.contracts import SceneError
+from heatsplat.io.recorded import OVERRIDES
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.runs.checks import check_copied, checked
 from heatsplat.runs.folder import results_in
@@ -119,6 +121,30 @@ def test_results_of_other_settings_are_not_taken_for_those_of_this_run(trained):
         heatsplat.train(heatsplat.compose([*QUICK, "seed=7"]), folder)
     with pytest.raises(OccupiedError, match=r"other settings \([^,]+(, [^,]+){4} and \d+ more\): give another folder"):
         heatsplat.train(heatsplat.compose([*QUICK, "method=energy_balance"]), folder)
+
+
+def test_results_whose_checkpoints_were_removed_are_those_of_what_the_command_line_gave(trained, tmp_path):
+    folder, config, results = trained
+    shutil.copy(folder / METRICS_FILE, tmp_path)
+    with pytest.raises(OccupiedError, match="results without a checkpoint that tells of which settings they are"):
+        results_in(tmp_path, config)
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / OVERRIDES).write_text(
+        "\n".join(f"- {text}" for text in [*config["overrides"], "callbacks.images=null"])
+    )
+    assert results_in(tmp_path, config).test == results.test
+    with pytest.raises(OccupiedError, match=r"other settings \(max_steps, method\)"):
+        results_in(tmp_path, heatsplat.compose([*QUICK, "method=etgs", "max_steps=20", "threads=1"]))
+
+
+def test_a_run_goes_on_from_its_latest_step_whenever_its_files_were_copied(trained, tmp_path):
+    folder, config, _ = trained
+    (tmp_path / "checkpoints").mkdir()
+    for age, step in enumerate((6, 2, 4)):
+        path = shutil.copy(folder / "checkpoints" / f"step_{step:06d}.ckpt", tmp_path / "checkpoints")
+        os.utime(path, (1e9 + age, 1e9 + age))
+    (tmp_path / "checkpoints" / "step_000009.ckpt").write_bytes(b"half of a f")
+    assert resumed(checked(config), tmp_path)["ckpt"] == str(tmp_path / "checkpoints" / "step_000006.ckpt")
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from heatsplat.io.results import checkpoint_of
 from heatsplat.io.settings import at
 from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.trust import trusted
-from heatsplat.training.checkpoints import load_checkpoint
+from heatsplat.training.checkpoints import load_checkpoint, step_of
 from heatsplat.training.module import CHECKPOINT_KEY
 
 log = logging.getLogger("heatsplat")
@@ -97,9 +97,13 @@ def on_scene(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
 
 
 def checkpoints_in(output_dir: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Checkpoints in a run's folder with their paths, newest first; those that cannot be read are passed over, with a word."""
+    """Checkpoints in a run's folder with their paths, the one of the latest step first; those that cannot be read are passed
+    over, with a word.
+
+    By their steps, for times of files are those of their copies where a folder was moved.
+    """
     paths = (output_dir / "checkpoints").glob("*.ckpt")
-    for path in sorted(paths, key=lambda path: path.stat().st_mtime, reverse=True):
+    for path in sorted(paths, key=lambda path: (step_of(path), path.stat().st_mtime), reverse=True):
         try:
             yield path, load_checkpoint(path)
         except SceneError as error:  # a disk that was full
@@ -137,6 +141,12 @@ def stored_config(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     own = checkpoint.get(CHECKPOINT_KEY)
     config = own.get("config") if isinstance(own, dict) else None
     return config if isinstance(config, dict) else {}
+
+
+def learned_by(overrides: Mapping[str, str]) -> dict[str, str]:
+    """Those of the overrides that say what a run learns: not where and how it runs."""
+    without = NOT_LEARNED | {"launcher"}
+    return {key: value for key, value in overrides.items() if key.lstrip("+~").partition(".")[0] not in without}
 
 
 def shortened(names: Sequence[str]) -> str:

@@ -13,8 +13,8 @@ from typing import Any
 from heatsplat.composition import further_places
 from heatsplat.contracts import SceneError
 from heatsplat.io.command_lines import key_of, setting
+from heatsplat.io.recorded import OVERRIDES, overrides_of
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
-from heatsplat.studies.recorded import OVERRIDES, overrides_of
 
 log = logging.getLogger("heatsplat")
 

@@ -13,8 +13,8 @@ from typing import Any
 import pandas as pd
 
 from heatsplat.contracts import SceneError
+from heatsplat.io.recorded import CONFIG, OVERRIDES, config_of, overrides_of
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
-from heatsplat.studies.recorded import CONFIG, OVERRIDES, config_of, overrides_of
 
 # Overrides that make no other recipe. runs.resume.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of
 # folders, are among them; the method is named by itself.

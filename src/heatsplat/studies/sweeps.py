@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, literal, series_look, write_png
+from heatsplat.io.recorded import OVERRIDES
 from heatsplat.io.tables import NONE, markdown_table, over_seeds, write_csv
 from heatsplat.metrics.definitions import described, unit_of
 from heatsplat.studies.child_runs import all_rows
 from heatsplat.studies.finished import Runs, read_runs, row_names, settings_of
-from heatsplat.studies.recorded import OVERRIDES
 
 log = logging.getLogger(__name__)
 

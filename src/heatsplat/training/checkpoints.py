@@ -79,6 +79,14 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
     return found
 
 
+def step_of(path: Path) -> int:
+    """The step of a checkpoint, of which no tensor is read; -1 where the file cannot be read."""
+    try:
+        return int(torch.load(path, map_location="cpu", weights_only=True, mmap=True)["global_step"])
+    except Exception:  # as of ``load_checkpoint``, which says what is wrong
+        return -1
+
+
 def _broken(file: io.BufferedReader) -> str | None:
     """What is wrong with the bytes of a checkpoint, or None. torch reads past wrong checksums."""
     with zipfile.ZipFile(file) as archive:

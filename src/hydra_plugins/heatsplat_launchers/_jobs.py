@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import os
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -164,7 +164,8 @@ def _configuration(context: HydraContext, config: DictConfig, number: int, overr
 
 def _finished(job: Job) -> JobReturn | None:
     """What a job returned that has results of its settings already, else None."""
-    from heatsplat.studies.recorded import overrides_of
+    from heatsplat.io.recorded import overrides_of
+    from heatsplat.runs.resume import learned_by
 
     file = job.folder / METRICS_FILE
     if not file.exists():
@@ -174,20 +175,12 @@ def _finished(job: Job) -> JobReturn | None:
         before = overrides_of(job.folder)
     except (ValueError, OSError):  # the job says so itself, and takes no other down
         return None
-    if _learned(before) != _learned(as_dict(job.overrides)):
+    if learned_by(before) != learned_by(as_dict(job.overrides)):
         return None  # the job compares what was composed, and refuses the results of other settings
     log.info("#%d has results already; skipped. Delete %s to run it again.", job.number, job.folder)
     done = JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED)
     done.return_value = results.test.get("psnr")
     return done
-
-
-def _learned(overrides: Mapping[str, str]) -> dict[str, str]:
-    """Those of the overrides that say what a job learns: not where and how it runs."""
-    from heatsplat.runs.resume import NOT_LEARNED
-
-    without = NOT_LEARNED | {"launcher"}
-    return {key: value for key, value in overrides.items() if key.lstrip("+~").partition(".")[0] not in without}
 
 
 def _died(job: Job, error: Exception) -> JobReturn:

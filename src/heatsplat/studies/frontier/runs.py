@@ -13,11 +13,11 @@ from typing import Any
 
 import pandas as pd
 
+from heatsplat.io.recorded import OVERRIDES
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE
 from heatsplat.io.tables import read_csv
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.finished import Runs, read_runs, settings_of, told_apart, unshared
-from heatsplat.studies.recorded import OVERRIDES
 
 log = logging.getLogger("heatsplat")
 

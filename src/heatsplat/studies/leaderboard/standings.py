@@ -15,11 +15,11 @@ from typing import Any
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.files import write_atomically
+from heatsplat.io.recorded import OVERRIDES, overrides_of
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.studies.finished import reason_of
 from heatsplat.studies.leaderboard.earlier import EarlierSeeds, Place, add_earlier, sentence
 from heatsplat.studies.leaderboard.plan import Board
-from heatsplat.studies.recorded import OVERRIDES, overrides_of
 from heatsplat.studies.score import COSTS, META, SCENES, TRUTH, SceneScore, score_scene
 
 SCORE_FILE, SUBMISSION = "score.json", "submission"
