@@ -21,6 +21,7 @@ from heatsplat.uncertainty import (
     _calibrated,
     _pixels,
     _shares,
+    _stride,
     evidence,
     redundancy,
     shown,
@@ -175,6 +176,28 @@ def test_held_out_images_of_which_no_pixel_counts_are_passed_over(tmp_path, capl
     assert "too narrow" not in caplog.text
     module.scene = masked(0, 1, 2)
     assert 0.5 < Uncertainty(module).coverage() < 0.9 and "holds no images out of which pixels count" in caplog.text
+
+
+def test_of_many_held_out_images_only_the_pixels_that_calibrate_are_kept(tmp_path, monkeypatch):
+    module, _ = run(tmp_path, "method=3dgs", "data.scene=static", "max_steps=20", *BARE)
+    frames = module.scene.val.frames
+    camera = frames[0].camera
+    rows = sum(frame.camera.height for frame in frames)
+    monkeypatch.setattr(uncertainty, "PIXELS", rows)  # one of each row
+    found = Uncertainty(module)._parts(module.scene.val, uncertainty.STRETCHES)
+    assert all(part.untyped_storage().nbytes() == part.numel() * part.itemsize for part in found)
+    assert 0.9 * rows < sum(map(len, found)) <= rows
+    # Those of one column alone would calibrate what all columns have.
+    assert _stride(camera.width, camera.width) == camera.width + 1
+
+
+@pytest.mark.parametrize(
+    ("every", "width", "expected"),
+    [(0, 160, 1), (4, 160, 4), (65, 640, 65), (160, 160, 161), (80, 160, 81), (7, 5, 7), (5, 5, 6)],
+)
+def test_pixels_are_taken_of_many_columns(every, width, expected):
+    found = _stride(every, width)
+    assert found == expected and len({place % width for place in range(0, found * width, found)}) >= min(16, width)
 
 
 def recorded(noise, error=0.10, count=40_000):

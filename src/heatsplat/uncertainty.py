@@ -22,6 +22,8 @@ log = logging.getLogger("heatsplat")
 
 WITHIN = 0.6827  # share of a normal distribution within one standard deviation
 PIXELS = 40_000  # that calibrate: so many tell five numbers
+COLUMNS = 16  # of an image at least, from which these come
+KNOWN = 1 << 25  # pixels of training images at most, of which the spread is that of the scene's values
 ROUNDS = 60  # of the optimiser that finds them
 # By how much of itself the noise that images tell (``noise_of_views``) is off where it outweighs detail: by -1.5 to 3 % on four
 # synthetic scenes in two sizes, with noise of 0.5 K.
@@ -64,6 +66,20 @@ def _pixels(view: View, modality: str) -> Tensor:
     """Values of the pixels of a view that its mask leaves, of any shape in a row."""
     image = view.image(modality)
     return (image if view.mask is None else image[view.mask]).flatten()
+
+
+def _pixels_of(views: ViewSet) -> int:
+    """How many pixels the images of some views have."""
+    return sum(frame.camera.width * frame.camera.height for frame in views.frames)
+
+
+def _stride(every: int, width: int) -> int:
+    """Every how many-th pixel of an image, row by row, is taken: ``every`` or a little more, where that would always meet the
+    same few columns."""
+    every = max(1, every)
+    while width // math.gcd(every, width) < min(COLUMNS, width):
+        every += 1
+    return every
 
 
 def _that_tell(views: ViewSet) -> ViewSet:
@@ -190,7 +206,8 @@ class Uncertainty:
         self.unit = 1.0 if bounds is None else bounds.span_k
         self.noise = noise_of_views(scene.train, module.modality)
         # Copies, for a slice would keep its whole image in memory.
-        known = torch.cat([_pixels(view, module.modality)[::7].clone() for view in scene.train])
+        every = max(7, _pixels_of(scene.train) // KNOWN)
+        known = torch.cat([_pixels(view, module.modality)[::every].clone() for view in scene.train])
         if not len(known):
             raise SceneError(
                 f"masks leave no pixel of the training views of scene '{scene.name}', which tell how certain it is"
@@ -382,7 +399,7 @@ class Uncertainty:
 
     def _parts(self, views: ViewSet, stretches: Sequence[float]) -> list[Tensor]:
         """Of some pixels of each view the squared residual and the variances, [P, 1 + S + V]."""
-        every = max(1, sum(frame.camera.width * frame.camera.height for frame in views.frames) // PIXELS)
+        every = _pixels_of(views) // PIXELS
         found = []
         for view in views:
             squares = (
@@ -390,7 +407,8 @@ class Uncertainty:
             )
             rows = torch.cat([squares[..., None], self._variances(view.frame, stretches)], dim=-1).flatten(0, 1)
             counted = rows.isfinite().all(1) if view.mask is None else rows.isfinite().all(1) & view.mask.reshape(-1)
-            found.append(rows[counted][::every])
+            # A copy, for a slice would keep the rows of the whole image in memory.
+            found.append(rows[counted][:: _stride(every, view.frame.camera.width)].clone())
         return found
 
     @cached_property

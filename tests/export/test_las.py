@@ -26,6 +26,9 @@ def test_another_library_reads_what_was_written(cooling, tmp_path, compressed):
     assert torch.allclose(torch.tensor(np.array(found["opacity"])), cooling.seen.opacities[shown])
     colours = Las().colours(cooling)[shown.numpy()]
     assert np.abs(found.red / 65535 - colours[:, 0]).max() < 1e-4
+    # First and last return of its pulse, as the format counts them; programs that take either found none.
+    assert (np.array(found.return_number) == 1).all() and (np.array(found.number_of_returns) == 1).all()
+    assert found.header.number_of_points_by_return[0] == len(found.points)
 
 
 def test_faint_gaussians_are_left_out_and_counted(cooling, tmp_path, caplog):

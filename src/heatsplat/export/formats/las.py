@@ -84,6 +84,8 @@ class Las(Coloured):
             header.global_encoding.wkt = True
         data = laspy.LasData(header)
         data.x, data.y, data.z = points.T
+        # Each point is the one return of a pulse: programs that look at first or last returns leave out those with number 0.
+        data.return_number[:] = data.number_of_returns[:] = 1
         data.red, data.green, data.blue = (self.colours(moment)[kept].T * 65535).astype("u2")
         for name, values in zip(names, columns.values(), strict=True):
             data[name] = values.numpy()[kept]
