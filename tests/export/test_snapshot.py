@@ -8,7 +8,8 @@ import torch
 from exported import started
 
 from heatsplat.contracts import SceneError
-from heatsplat.export.snapshot import snapshot
+from heatsplat.export.moment import moments
+from heatsplat.export.snapshot import _ends, _Visible, snapshot
 from heatsplat.shots import at_time
 
 TOLERANCE = 0.05
@@ -40,6 +41,24 @@ def test_emission_over_time_is_that_of_the_model(tmp_path, composite):
         below = place.long().clamp(0, len(seen.table) - 2)
         found = seen.table[below] + (place - below) * (seen.table[below + 1] - seen.table[below])
         assert (found - expected.clamp(*seen.limits)).abs().max() <= 1.2 * TOLERANCE
+
+
+@pytest.mark.parametrize("clipped", [True, False])
+def test_a_gaussian_far_beyond_the_range_leaves_the_others_their_temperatures(tmp_path, clipped):
+    module = started_alone(tmp_path, "method=etgs", "thermal.frequencies=0", "composite=stefan_boltzmann")
+    scene, time_s = module.scene, module.scene.train.frames[3].time_s
+    expected = scene.thermal_range.to_celsius(module.emissions(module.splats, scene.train.frames[3])[:, 0])[1:]
+    with torch.no_grad():
+        module.splats.raw["initial_state"][0] += 10.0
+    seen = snapshot(module)
+    if not clipped:  # as of surfaces that a camera sees through something
+        camera = replace(seen.layers[0], clipped=False)
+        ends = _ends([camera], 0.0)
+        seen = replace(seen, layers=[camera], table_ends=ends, table=_Visible(module).table(ends))
+        assert ends[1] > 5.0
+    (moment,) = moments(module, seen, time_s)
+    inside = (expected > scene.thermal_range.min_c) & (expected < scene.thermal_range.max_c)
+    assert inside.all() and (moment.values[1:] - expected).abs().max() < 1.2 * TOLERANCE
 
 
 def test_the_truth_of_a_synthetic_scene_is_a_layer(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,7 +30,8 @@ FEW_TIMES, FEW_CURVES = 65, 24  # the same of models for which
 WORK = 4e10  # multiply-adds do not suffice; a minute of one thread
 RECALLED = 4  # times as many under weather, where a moment goes on from what was marched before
 MOMENTS = 2  # at which all Gaussians are asked for, for each curve
-TABLE = 257  # entries of a table of temperatures
+TABLE = 257  # entries of a table of temperatures for each range of blended values from 0 to 1, and
+LARGEST = 2048  # at most: a texture of any graphics card is as wide
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Snapshot:
         means [N, 3], quats [N, 4] wxyz, scales [N, 3], opacities [N]: as rendered; float32.
         layers: what they emit; the first one is "camera".
         background: blended behind all.
-        table: [257] temperatures (in ``unit``) of blended values evenly from ``table_ends[0]`` to ``table_ends[1]``.
+        table: [257 or more] temperatures (in ``unit``) of blended values evenly from ``table_ends[0]`` to ``table_ends[1]``.
         unit: "°C", or empty where image values are no temperatures.
         limits: values that an image can show, in ``unit``.
         colours: [N, 3] of the visible image in [0, 1], or None; ``colour_opacities`` [N] are theirs.
@@ -331,7 +333,9 @@ class _Visible:
 
     def table(self, ends: tuple[float, float]) -> Tensor:
         """``Snapshot.table`` between two blended values."""
-        values = torch.linspace(*ends, TABLE, dtype=torch.float64)[:, None].expand(-1, self.channels)
+        # As fine where single Gaussians widen it: of radiance, temperatures between entries are not on a straight line.
+        entries = 1 + min(math.ceil((TABLE - 1) * (ends[1] - ends[0])), LARGEST - 1)
+        values = torch.linspace(*ends, entries, dtype=torch.float64)[:, None].expand(-1, self.channels)
         shown = self.module.composite.decode(values, self.channels)[:, 0]
         return (self.scene.thermal_range.to_celsius(shown) if self.unit else shown).float()
 
@@ -374,7 +378,7 @@ def _inside(values_at: ValuesAt) -> ValuesAt:
 def _ends(layers: list[Layer], background: float) -> tuple[float, float]:
     """Range of blended values that a pixel of any layer can have."""
     low, high = min(0.0, background), max(1.0, background)
-    for layer in layers:
+    for layer in (layer for layer in layers if not layer.clipped):
         basis = layer.basis
         reach = (basis.coefficients.abs() @ basis.curves.abs()).amax(1) if basis.rank else torch.zeros(1)
         low = min(low, (basis.offsets - reach).min().item())
