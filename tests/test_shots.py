@@ -88,6 +88,19 @@ def test_every_image_of_a_frame_has_files_of_its_own_and_one_range(tmp_path):
     assert not (first[60:] == second[60:]).all()
 
 
+def test_a_film_of_cameras_with_images_of_several_sizes_has_the_size_of_its_first(tmp_path):
+    scene = make_scene()
+    first = scene.train.frames[0]
+    sizes = [(48, 40), (96, 30), (20, 100)]
+    frames = [replace(first, name=f"{w}x{h}.png", camera=first.camera.resized(w, h)) for w, h in sizes]
+    images = [({"recorded": torch.full((h, w, 1), 0.5)}, None) for w, h in sizes]
+    write_shot(images, frames, scene, ShotFiles(tmp_path, codec="mpeg4"))
+    film, shapes = cv2.VideoCapture(str(tmp_path / "video.mp4")), []
+    while (read := film.read())[0]:
+        shapes.append(read[1].shape)
+    assert shapes == [cv2.imread(str(tmp_path / "png" / "48x40.png")).shape] * 3
+
+
 def test_a_still_shows_the_moment_of_its_view_and_a_film_the_record():
     scene = make_scene()
     taken = scene.train.frames[1]

@@ -16,7 +16,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_count, check_numbers, check_option
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
-from heatsplat.io.pictures import Bar, Panel, bar_unit, compose, image_panel, write_figure, write_png
+from heatsplat.io.pictures import Bar, Panel, bar_unit, compose, fitted, image_panel, write_figure, write_png
 from heatsplat.io.quantities import clock_of, moment
 from heatsplat.io.tiff import write_temperature
 from heatsplat.io.video import video as film
@@ -218,7 +218,9 @@ class ShotFiles:
     figures: str | None = None
     written: list[Path] = field(default_factory=list, init=False)
     videos: ExitStack = field(default_factory=ExitStack, init=False, repr=False)  # closes those that are open
-    _films: dict[str, Callable[[np.ndarray], None]] = field(default_factory=dict, init=False, repr=False)
+    _films: dict[str, tuple[Callable[[np.ndarray], None], tuple[int, int]]] = field(
+        default_factory=dict, init=False, repr=False
+    )  # what adds a picture to each, and height and width of its pictures
 
     def add(self, name: str) -> Path:
         """The path of a file that is written now."""
@@ -231,7 +233,8 @@ class ShotFiles:
             write_temperature(self.add(f"tiff{suffix}/{stem}.tiff"), values)
 
     def add_picture(self, suffix: str, stem: str, panel: Panel, title: str, moving: bool = True) -> None:
-        """Writes a picture of a frame under a title, and adds it to its video where it is ``moving``."""
+        """Writes a picture of a frame under a title, and adds it to its video where it is ``moving``: at the size of its first
+        picture, for cameras may have images of several."""
         filmed = self.video and moving
         if not (self.png or filmed):
             return
@@ -241,8 +244,9 @@ class ShotFiles:
         if filmed:
             if suffix not in self._films:
                 path = self.add(f"video{suffix}.mp4")
-                self._films[suffix] = self.videos.enter_context(film(path, self.fps, self.codec))
-            self._films[suffix](picture)
+                self._films[suffix] = self.videos.enter_context(film(path, self.fps, self.codec)), picture.shape[:2]
+            add, size = self._films[suffix]
+            add(picture if picture.shape[:2] == size else fitted(picture, *size))
 
     def add_figure(self, stem: str, panels: Sequence[Panel], title: str) -> None:
         """Writes a figure of a frame."""

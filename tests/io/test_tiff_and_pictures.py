@@ -21,6 +21,7 @@ from heatsplat.io.pictures import (
     comparison_panels,
     compose,
     error_limit_of,
+    fitted,
     image_panel,
     visible,
     write_figure,
@@ -254,3 +255,20 @@ def test_visible_light_that_nobody_has_seen_is_hatched_like_temperatures():
     hatched = colorize(unseen, 0.0, 40.0)
     assert (found[4:20, 8:30] == hatched[4:20, 8:30]).all() and len(np.unique(found[4:20, 8:30])) > 1
     assert (found[:4] == 128).all()
+
+
+def test_a_picture_of_another_size_lies_in_the_middle_of_the_paper_and_is_made_smaller_where_it_is_larger():
+    ink = np.zeros((10, 20, 3), dtype=np.uint8)
+    padded, smaller = fitted(ink, 14, 20), fitted(ink, 10, 10)
+    assert (
+        padded.shape == (14, 20, 3)
+        and (padded[2:12] == 0).all()
+        and (padded[:2] == 255).all()
+        and (padded[12:] == 255).all()
+    )
+    assert (
+        smaller.shape == (10, 10, 3)
+        and (smaller[2:7] == 0).all()
+        and (smaller[:2] == 255).all()
+        and (smaller[7:] == 255).all()
+    )

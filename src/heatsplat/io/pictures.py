@@ -276,6 +276,18 @@ def compose(panels: Sequence[Panel], title: str = "", columns: int | None = None
     return np.asarray(page)
 
 
+def fitted(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+    """A picture, uint8 RGB, in the middle of white paper [height, width, 3]; smaller where it is larger than that."""
+    factor = min(1.0, height / picture.shape[0], width / picture.shape[1])
+    if factor < 1.0:
+        rows, columns = (max(1, int(side * factor)) for side in picture.shape[:2])
+        picture = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
+    page = np.full((height, width, 3), PAPER, dtype=np.uint8)
+    top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
+    page[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+    return page
+
+
 def _row(panels: Sequence[Panel]) -> np.ndarray:
     """Panels beside each other, each under its title, with a margin below only, uint8 RGB."""
     line = FONT + 9
