@@ -86,6 +86,16 @@ def test_the_middle_of_a_record_is_a_moment_that_was_recorded(times_s, middle_s)
     assert scene(times_s, [100.0]).middle_s == middle_s
 
 
+def test_a_long_record_is_looked_through_once_however_many_moments_are_asked(monkeypatch):
+    known, asked = scene([2.0, 12.0, 4.0]), []
+    times_s = ViewSet.times_s.fget
+    monkeypatch.setattr(ViewSet, "times_s", property(lambda views: asked.append(1) or times_s(views)))
+    assert [known.beyond_record(time_s) for time_s in (None, 0.5, 3.0, 15.0)] == [0.0, 1.5, 0.0, 3.0]
+    before = len(asked)
+    assert known.record == (2.0, 10.0) and known.beyond_record(20.0) == 8.0 and len(asked) == before
+    assert scene([None, 3.0]).beyond_record(9.0) == 0.0
+
+
 def test_thermal_images_alone_have_a_range():
     known = scene([0.0])
     assert known.range_of("thermal") is known.range_of("clean") is known.thermal_range

@@ -440,17 +440,22 @@ class SceneData:
         Raises:
             SceneError: a training view has no time.
         """
-        if "time" not in self.metadata:
+        if self._ends is None:
             raise SceneError(f"scene '{self.name}' has training views without a time, so it has no record")
-        first, last = min(self.train.times_s), max(self.train.times_s)
+        first, last = self._ends
         return first, last - first if last > first else 1.0
 
     def beyond_record(self, time_s: float | None) -> float:
         """Seconds between a moment and the nearest one of the training record; 0 within it, or without times."""
-        if time_s is None or "time" not in self.metadata:
+        if time_s is None or self._ends is None:
             return 0.0
-        times = self.train.times_s
-        return max(min(times) - time_s, time_s - max(times), 0.0)
+        first, last = self._ends
+        return max(first - time_s, time_s - last, 0.0)
+
+    @cached_property
+    def _ends(self) -> tuple[float, float] | None:
+        """First and last time of the training record, which long shots ask for at every frame; None without times."""
+        return (min(self.train.times_s), max(self.train.times_s)) if "time" in self.metadata else None
 
     @cached_property
     def extent(self) -> float:

@@ -22,11 +22,15 @@ class TemperatureRenders(pl.Callback):
 
     def __init__(self, folder: str = "submission", image: str = "thermal") -> None:
         self.folder, self.image = folder, image
+        self._named: tuple[Any, dict[str, str]] = (None, {})  # test frames, and what their files are called
 
     def on_test_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, outputs: Any, *_: Any) -> None:
         bounds = module.scene.range_of(module.modality)
         if bounds is None:
             return
         image = outputs["companions"].get(self.image, outputs["prediction"])
-        stem = file_stems([frame.name for frame in module.scene.test.frames])[outputs["view"].frame.name]
+        frames = module.scene.test.frames
+        if self._named[0] is not frames:
+            self._named = frames, file_stems([frame.name for frame in frames])
+        stem = self._named[1][outputs["view"].frame.name]
         write_temperature(module.output_dir / self.folder / f"{stem}.tiff", bounds.to_celsius(image.cpu()))
