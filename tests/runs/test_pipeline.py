@@ -147,6 +147,23 @@ def test_a_run_goes_on_from_its_latest_step_whenever_its_files_were_copied(train
     assert resumed(checked(config), tmp_path)["ckpt"] == str(tmp_path / "checkpoints" / "step_000006.ckpt")
 
 
+def test_a_run_that_began_at_another_s_checkpoint_goes_on_from_its_own(trained, tmp_path):
+    first = trained[0] / "checkpoints" / "last.ckpt"
+    config = heatsplat.compose([*QUICK, "max_steps=16", f"ckpt='{first}'", "test=false"])
+    heatsplat.train(config, tmp_path)
+    own = tmp_path / "checkpoints"
+    for name in ("last", "step_000016"):  # as if it had been killed
+        (own / f"{name}.ckpt").unlink()
+    assert resumed(checked(config), tmp_path)["ckpt"] == str(own / "step_000012.ckpt")
+    other = (
+        shutil.copytree(trained[0], tmp_path / "other", ignore=shutil.ignore_patterns("step_*"))
+        / "checkpoints"
+        / "last.ckpt"
+    )
+    begun = checked(config | {"ckpt": str(other)})
+    assert resumed(begun, tmp_path)["ckpt"] == str(other)  # which it did not begin at
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [

@@ -36,8 +36,9 @@ SHOWN = 5  # names of settings in a message
 def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
     """The configuration with what an earlier run measured for it, and with ``ckpt``, where there is one to go on from.
 
-    "verdicts" are those on its scene, which took "choosing_seconds"; "budget" is its plan. A checkpoint of the last step of a
-    run is not gone on from, for there would be no step left in which the cost could be measured.
+    "verdicts" are those on its scene, which took "choosing_seconds"; "budget" is its plan. A run that was given the checkpoint of
+    another goes on from its own where it was stopped later than that. A checkpoint of the last step of a run is not gone on from,
+    for there would be no step left in which the cost could be measured.
 
     Args:
         config: as composed and checked.
@@ -51,7 +52,8 @@ def resumed(config: dict[str, Any], output_dir: Path) -> dict[str, Any]:
     if config["ckpt"] is not None:
         config = config | {"ckpt": str(checkpoint_of(config["ckpt"]))}
         check_own(config, output_dir)
-        return _continued(config, load_checkpoint(config["ckpt"]))
+        given = load_checkpoint(config["ckpt"])
+        return _further(_continued(config, given), given["global_step"], output_dir)
     composed = config  # of which the plan of an earlier budget is no part
     for path, checkpoint in checkpoints_in(output_dir):
         stored = stored_config(checkpoint)
@@ -200,6 +202,24 @@ def _continued(config: dict[str, Any], checkpoint: Mapping[str, Any]) -> dict[st
         config = config | _measured(stored, ckpt, "verdicts", "choosing_seconds")
     if stored.get("name") == config["name"]:
         _check_steps_left(config, checkpoint)
+    return config
+
+
+def _further(config: dict[str, Any], step: int, output_dir: Path) -> dict[str, Any]:
+    """The configuration of a run that was given another run's checkpoint, of that ``step``; where it was stopped later, with its
+    own checkpoint in the folder in place of that."""
+    folder = output_dir.resolve()
+    if Path(run_of(config["ckpt"])) == folder:
+        return config
+    for path, checkpoint in checkpoints_in(output_dir):
+        stored = stored_config(checkpoint)
+        began = stored.get("ckpt")  # at the same one, or at one of its own when it went on before
+        same = began is not None and (
+            Path(began).resolve() == Path(config["ckpt"]).resolve() or Path(run_of(began)) == folder
+        )
+        if same and step < checkpoint["global_step"] < planned_end(checkpoint):
+            log.info("going on from step %d of %s", checkpoint["global_step"], path)
+            return config | _measured(stored, path, "verdicts", "choosing_seconds", "budget") | {"ckpt": str(path)}
     return config
 
 
