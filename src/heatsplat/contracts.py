@@ -406,6 +406,11 @@ class SceneData:
         return (low + high) / 2, max((high - low).max().item(), 1e-12)
 
     @property
+    def origin(self) -> Tensor:
+        """[3] float64 place in the data set from which coordinates count, where its own are too large for float32; else 0."""
+        return torch.tensor(self.notes.get("origin", (0.0, 0.0, 0.0)), dtype=torch.float64)
+
+    @property
     def distance(self) -> float:
         """Median distance between the training cameras and the middle of the points, in world units."""
         centers = torch.stack([frame.camera.center for frame in self.train.frames])

@@ -27,8 +27,10 @@ def render(frame, depth, camera):
     return SimpleNamespace(features=image[..., None], depth=away, alpha=torch.ones(1, *away.shape))
 
 
-def test_the_warm_patch_is_found(tmp_path):
-    module = SimpleNamespace(scene=wall(), modality="thermal", output_dir=tmp_path, render=render)
+@pytest.mark.parametrize("origin", [None, [599456.5, 5695495.25, -20.0]])
+def test_the_warm_patch_is_found_in_the_coordinates_of_the_data_set(tmp_path, origin):
+    scene = wall() if origin is None else replace(wall(), notes={"origin": origin})
+    module = SimpleNamespace(scene=scene, modality="thermal", output_dir=tmp_path, render=render)
     ExtremeSurfaces(views=4, share=0.02).on_test_epoch_end(None, module)
     rows = read_csv(tmp_path / SURFACES_FILE)
     hottest, times = rows[0], module.scene.train.times_s
@@ -37,7 +39,8 @@ def test_the_warm_patch_is_found(tmp_path):
     assert hottest["kind"] == "hottest" and hottest["time_s"] == pytest.approx(taken)
     assert hottest["mean_c"] == pytest.approx(float(RANGE.to_celsius(warmth(taken))), abs=0.01)
     assert hottest["area"] == pytest.approx(0.2, rel=0.2) and hottest["unit"] == "square units"
-    assert [hottest[axis] for axis in "xyz"] == pytest.approx([-0.5, 0.1, 4.0], abs=0.08)
+    place = np.array([-0.5, 0.1, 4.0]) + (origin or 0.0)
+    assert [hottest[axis] for axis in "xyz"] == pytest.approx(place.tolist(), rel=0, abs=0.08)
     assert rows[-1]["kind"] == "coldest" and rows[-1]["mean_c"] < 15
     assert (tmp_path / SURFACES_PICTURE).stat().st_size > 1000 and WIDTH == 56
 

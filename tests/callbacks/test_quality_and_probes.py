@@ -297,14 +297,17 @@ def test_dots_stand_for_the_truth_on_real_scenes(tmp_path):
 def test_the_table_of_probes_has_the_clock_and_places(tmp_path):
     times = torch.tensor([-100.0, 2 * SECONDS], dtype=torch.float64)
     weather = Weather(times, air_c=torch.tensor([5.0, 6.0], dtype=torch.float64), notes={"utc_at_zero_s": 1722965689.0})
+    far = {"origin": [599456.5, 5695495.25, 0.0]}  # taken off coordinates of UTM
     evaluate(
-        FakeModule(replace(wall(), weather=weather), tmp_path),
+        FakeModule(replace(wall(), weather=weather, notes=far), tmp_path),
         trainer(tmp_path, [TemperatureCurves(times=4)], logger=False),
     )
     rows = read_csv(tmp_path / "renders" / "probes.csv")
     assert [row["clock"] for row in rows[:2]] == ["2024-08-06 17:34:49 UTC", "2024-08-06 17:38:09 UTC"]
     places = read_csv(tmp_path / "renders" / "probe_positions.csv")
-    assert [[row[axis] for axis in "xyz"] for row in places] == [[-0.5, 0.0, 4.0], [0.5, pytest.approx(0.2), 4.0]]
+    expected = [[599456.0, 5695495.25, 4.0], [599457.0, 5695495.45, 4.0]]
+    found = [[row[axis] for axis in "xyz"] for row in places]
+    assert np.allclose(found, expected, rtol=0, atol=1e-5)
     assert [row["name"] for row in places] == ["probe 1", "probe 2"]
     assert {row["view"] for row in places} <= {frame.name for frame in wall().val.frames}
 

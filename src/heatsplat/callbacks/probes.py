@@ -132,10 +132,10 @@ class TemperatureCurves(pl.Callback):
         write_csv(module.output_dir / "renders" / "probes.csv", rows, columns)
 
     def _write_positions(self, module: pl.LightningModule) -> None:
-        """Where each probe lies in scene coordinates, and the image and the pixel that its curve is of."""
-        rows = []
+        """Where each probe lies in the coordinates of the data set, and the image and the pixel that its curve is of."""
+        rows, origin = [], module.scene.origin
         for probe in self._probes:
-            place = dict(zip("xyz", (round(value, 6) for value in probe.point.tolist()), strict=True))
+            place = dict(zip("xyz", (round(value, 6) for value in (probe.point + origin).tolist()), strict=True))
             rows.append(
                 {"name": probe.name, **place, "view": probe.frame.name, "row": probe.row, "column": probe.column}
             )

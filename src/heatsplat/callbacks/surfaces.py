@@ -37,8 +37,8 @@ class ExtremeSurfaces(pl.Callback):
 
     As the model renders them, without what the camera adds, at the moment of the training image nearest to the middle of the
     record. Areas are those of what training views see, in square metres where the scene's scale is known, by itself or by the
-    positions of its cameras (the log names these). The table tells where surfaces lie in the world, and on the earth where the
-    scene's camera positions do (``export.place``).
+    positions of its cameras (the log names these). The table tells where surfaces lie in the coordinates of the data set, and on
+    the earth where the scene's camera positions do (``export.place``).
 
     Args:
         views: training views from which surfaces are looked for, spread evenly.
@@ -71,7 +71,10 @@ class ExtremeSurfaces(pl.Callback):
                 "most_c": round(one.most, 3),
                 "area": float(f"{one.area * square:.3g}"),
                 "unit": f"{unit}²" if metres else "square units",
-                **{axis: round(value, 4) for axis, value in zip("xyz", one.centre.tolist(), strict=True)},
+                **{
+                    axis: round(value, 4)
+                    for axis, value in zip("xyz", (one.centre + scene.origin).tolist(), strict=True)
+                },
                 "time_s": frames[0].time_s,
             }
             for kind, found in (("hottest", hot), ("coldest", cold))

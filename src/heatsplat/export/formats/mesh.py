@@ -70,9 +70,7 @@ class Mesh(Format):
         scene = moment.module.scene
         chosen = evenly_spread(len(scene.train), len(scene.train) if self.views is None else self.views)
         looks = [moment.look(scene.train.frames[i]) for i in chosen]
-        # What was taken off the scene, where its coordinates are too large for float32.
-        origin = torch.tensor(scene.notes.get("origin", [0.0, 0.0, 0.0]), dtype=torch.float64)
-        values = values_at(looks, points - origin, None if self.two_sided else normals)
+        values = values_at(looks, points - scene.origin, None if self.two_sided else normals)
         if not values.isfinite().any():
             raise SceneError(
                 f"what.mesh={self.mesh}: no training view sees any of its {len(points)} vertices. Is it in the coordinates of "

@@ -45,6 +45,7 @@ class Npz(Format):
             "worst_error": moment.layer.worst,
             "time_s": moment.time_s,
             "left_out": seen.left_out,
+            "origin": moment.module.scene.notes.get("origin"),
         }
         with open(path, "wb") as file:
             np.savez_compressed(
