@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_count, check_numbers, check_option
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, check_count, check_numbers, check_option
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
 from heatsplat.io.pictures import Bar, Panel, bar_unit, compose, fitted, image_panel, write_figure, write_png
@@ -160,14 +160,18 @@ def sightings(scene: SceneData, depth_of: Callable[[Frame], Tensor]) -> list[Sig
     """
     found = []
     for view in scene.train:
-        camera, mask = view.camera, view.mask
-        coarse = camera.within(SIGHTING_SIZE)
-        if mask is not None:
-            rows = np.arange(coarse.height) * camera.height // coarse.height
-            columns = np.arange(coarse.width) * camera.width // coarse.width
-            mask = mask[rows][:, columns]
-        found.append(Sighting(coarse, depth_of(replace(view.frame, camera=coarse)).cpu(), mask))
+        coarse = view.camera.within(SIGHTING_SIZE)
+        found.append(Sighting(coarse, depth_of(replace(view.frame, camera=coarse)).cpu(), mask_on(coarse, view)))
     return found
+
+
+def mask_on(coarse: Camera, view: View) -> Tensor | None:
+    """The mask of a view on the coarser grid of a camera, [H, W] bool, True where a pixel counts; None where all do."""
+    if view.mask is None:
+        return None
+    rows = np.arange(coarse.height) * view.camera.height // coarse.height
+    columns = np.arange(coarse.width) * view.camera.width // coarse.width
+    return view.mask[rows][:, columns]
 
 
 def deviations_told(scene: SceneData) -> str:

@@ -45,6 +45,27 @@ def test_the_warm_patch_is_found_in_the_coordinates_of_the_data_set(tmp_path, or
     assert (tmp_path / SURFACES_PICTURE).stat().st_size > 1000 and WIDTH == 56
 
 
+def test_what_masks_leave_out_is_no_surface(tmp_path):
+    """No image told what the model shows there."""
+    scene = wall()
+
+    def masked(i):
+        view = scene.train[i]
+        camera = view.camera
+        points = surface_points(camera, torch.full((camera.height, camera.width), 4.0))
+        return replace(view, mask=(points[..., 0] + 0.5).abs() > 0.3)
+
+    module = SimpleNamespace(
+        scene=replace(scene, train=ViewSet(scene.train.frames, masked)),
+        modality="thermal",
+        output_dir=tmp_path,
+        render=render,
+    )
+    ExtremeSurfaces(views=4, share=0.02).on_test_epoch_end(None, module)
+    rows = read_csv(tmp_path / SURFACES_FILE)
+    assert rows and all(row["most_c"] < 15 and abs(row["x"] + 0.5) > 0.2 for row in rows)
+
+
 @pytest.mark.parametrize("timed", [True, False])
 def test_surfaces_are_seen_without_what_is_known_of_single_images(tmp_path, timed):
     """Such as the level of an image of wild_thermal, which drifts."""

@@ -1,11 +1,13 @@
 """LAS and LAZ as laspy reads them: points, temperatures, attributes."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from heatsplat.contracts import ViewSet
 from heatsplat.export.formats.las import Las, _shown
 from heatsplat.export.place import place_of
 
@@ -38,6 +40,14 @@ def test_faint_gaussians_are_left_out_and_counted(cooling, tmp_path, caplog):
     opaque = ((cooling.seen.opacities >= 0.1) & _shown(cooling)).sum().item()
     assert len(laspy.read(tmp_path / "a.las").points) == opaque
     assert f"{opaque} of {len(cooling.seen.opacities)} Gaussians have an opacity of 0.1 or more" in caplog.text
+
+
+def test_what_masks_leave_out_is_shown_by_no_view(cooling):
+    module, scene = cooling.module, cooling.module.scene
+    nothing = torch.zeros(scene.train[0].thermal.shape[:2], dtype=torch.bool)
+    masked = ViewSet(scene.train.frames, lambda i: replace(scene.train[i], mask=nothing))
+    hidden = SimpleNamespace(scene=replace(scene, train=masked), renderer=module.renderer)
+    assert _shown(cooling).any() and not _shown(replace(cooling, module=hidden)).any()
 
 
 def test_what_no_training_view_shows_is_left_out(cooling, tmp_path, caplog):

@@ -128,8 +128,8 @@ def _surfaces_section(folder: Path) -> list[str]:
     when = "" if time_s is None else f", {moment(time_s)} after the first training frame"
     note = (
         f"Connected surfaces seen by training views, as rendered by the model{when}: H the hottest, C the coldest. "
-        "Centres are in the coordinates of the data set. What has no texture and is seen at a flat angle, such as bare ground, may "
-        f"lie less deep than it is shown. Table: [{SURFACES_FILE}]({SURFACES_FILE})."
+        "Centres are in the coordinates of the data set. What has no texture and is seen at a flat angle, such as bare ground, "
+        f"may lie less deep than it is shown. Table: [{SURFACES_FILE}]({SURFACES_FILE})."
     )
     titles = ("", "mean", "hottest, coldest 2 %", "area", "centre x, y, z", "latitude, longitude")[: len(rows[0])]
     table = markdown_table(titles, rows, "lrrrrr"[: len(titles)])

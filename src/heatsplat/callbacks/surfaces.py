@@ -23,7 +23,7 @@ from heatsplat.geometry.projection import to_camera, to_pixels
 from heatsplat.io.pictures import Bar, Panel, colorize, compose, enlarged, lettering, write_png
 from heatsplat.io.quantities import moment
 from heatsplat.io.tables import write_csv
-from heatsplat.shots import SIGHTING_SIZE, at_time, first_free_id
+from heatsplat.shots import SIGHTING_SIZE, at_time, first_free_id, mask_on
 
 SURFACES_FILE = "surfaces.csv"
 SURFACES_PICTURE = "renders/surfaces.png"
@@ -57,8 +57,9 @@ class ExtremeSurfaces(pl.Callback):
         scene = module.scene
         if scene.range_of(module.modality) is None:
             return
-        frames = [middle(scene, scene.train.frames[i]) for i in evenly_spread(len(scene.train), self.views)]
-        looks = [look(module, frame) for frame in frames]
+        views = [scene.train[i] for i in evenly_spread(len(scene.train), self.views)]
+        frames = [middle(scene, view.frame) for view in views]
+        looks = [look(module, frame, mask_on(frame.camera, view)) for frame, view in zip(frames, views, strict=True)]
         hot, cold = extremes(looks, self.share, self.count, reach(scene))
         place = placed(scene) if hot or cold else None
         metres = unit_in_metres(scene, place)
@@ -122,12 +123,13 @@ def middle(scene: SceneData, frame: Frame) -> Frame:
 
 
 @torch.no_grad()
-def look(module: pl.LightningModule, frame: Frame) -> Look:
+def look(module: pl.LightningModule, frame: Frame, mask: Tensor | None = None) -> Look:
     """What the model shows in a frame, without what its camera adds, °C: from the camera as it is given, not as the run learned
-    it, for ``Look`` finds places by that camera's rays."""
+    it, for ``Look`` finds places by that camera's rays. NaN where a mask [H, W] is False: no image told what is there."""
     output = module.render(frame, depth=True, camera=frame.camera)
     values = module.scene.thermal_range.to_celsius(output.features[..., 0].clamp(0, 1))
-    return Look(frame.camera, surface_depth(output.depth, output.alpha[0]).cpu(), values.cpu())
+    values = values.cpu() if mask is None else values.cpu().where(mask, torch.nan)
+    return Look(frame.camera, surface_depth(output.depth, output.alpha[0]).cpu(), values)
 
 
 def picture(

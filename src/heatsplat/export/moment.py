@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Frame, SceneData, SceneError, check_option
+from heatsplat.contracts import SceneData, SceneError, View, check_option
 from heatsplat.export.snapshot import Layer, Snapshot
 from heatsplat.geometry.coverage import OPEN, surface_depth
 from heatsplat.geometry.looks import Look
@@ -53,13 +53,15 @@ class Moment:
         return found.where(blended.isfinite(), torch.nan)
 
     @torch.no_grad()
-    def look(self, frame: Frame) -> Look:
-        """The values as the camera of a frame sees them; NaN where it sees no surface."""
-        seen = self.seen
+    def look(self, view: View) -> Look:
+        """The values as the camera of a view sees them; NaN where it sees no surface, and where its mask leaves out what it sees:
+        nothing of its image told what is there."""
+        seen, frame = self.seen, view.frame
         shapes = seen.means, seen.quats, seen.scales, seen.opacities[None]
         output = self.module.renderer.values_seen(shapes, self.blended[:, None], frame.camera, depth=True)
         alpha = output.alpha[0]
-        means = (output.features[..., 0] / alpha).where(alpha >= OPEN, torch.nan)
+        known = alpha >= OPEN if view.mask is None else (alpha >= OPEN) & view.mask.to(alpha.device)
+        means = (output.features[..., 0] / alpha).where(known, torch.nan)
         return Look(frame.camera, surface_depth(output.depth, alpha), self.of_blended(means))
 
 

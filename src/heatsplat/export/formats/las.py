@@ -94,9 +94,9 @@ class Las(Coloured):
 
 def _shown(moment: Moment) -> Tensor:
     """Which Gaussians [N] lie where some training view shows a surface."""
-    frames = moment.module.scene.train.frames
+    views = moment.module.scene.train
     shown = torch.zeros(len(moment.seen.means), dtype=torch.bool)
     with torch.no_grad():
-        for i in evenly_spread(len(frames), VIEWS):
-            shown |= moment.look(frames[i]).sees(moment.seen.means)[0]
+        for i in evenly_spread(len(views), VIEWS):
+            shown |= moment.look(views[i]).sees(moment.seen.means)[0]
     return shown

@@ -23,8 +23,8 @@ log = logging.getLogger("heatsplat")
 class Mesh(Format):
     """PLY of a mesh in the coordinates of the scene, with °C and a colour at each vertex.
 
-    A vertex has the mean of the training views that see it: it lies in their image, before it stands nothing of the
-    scene, and its outward normal points towards them. Those that no view sees have NaN, and grey.
+    A vertex has the mean of the training views that see it: it lies in their image where that counts, before it stands nothing
+    of the scene, and its outward normal points towards them. Those that no view sees have NaN, and grey.
 
     Args:
         mesh: file that trimesh reads (PLY, OBJ, STL, GLB ...).
@@ -69,7 +69,7 @@ class Mesh(Format):
         points, normals = (torch.from_numpy(np.array(part)) for part in (given.vertices, given.vertex_normals))
         scene = moment.module.scene
         chosen = evenly_spread(len(scene.train), len(scene.train) if self.views is None else self.views)
-        looks = [moment.look(scene.train.frames[i]) for i in chosen]
+        looks = [moment.look(scene.train[i]) for i in chosen]
         values = values_at(looks, points - scene.origin, None if self.two_sided else normals)
         if not values.isfinite().any():
             raise SceneError(
