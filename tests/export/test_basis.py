@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
-from heatsplat.export.basis import _curves, _directions, _telling, constant_basis, rounded, steps_of, time_basis
+from heatsplat.export.basis import CHECKS, _curves, _directions, _telling, constant_basis, rounded, steps_of, time_basis
 
 COUNT = 200
 
@@ -132,6 +134,23 @@ def test_of_many_gaussians_few_are_sampled_and_the_odd_ones_are_found(monkeypatc
     assert basis.worst <= 1e-3 and errors.max() <= 1.5e-3
     alone = time_basis(many(count, odd=())[0], count, 0.0, 4.0, 1e-3, 513)
     assert alone.rank < basis.rank  # the odd ones have curves
+
+
+def test_of_many_gaussians_no_table_holds_all_moments_of_all(monkeypatch):
+    """Beside what is asked at each moment: for 2 million of them that took 5 GB more."""
+    count, sizes = 3000, []
+
+    class Sizes(TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            found = func(*args, **(kwargs or {}))
+            sizes.append(max((one.numel() for one in tree_leaves(found) if isinstance(one, torch.Tensor)), default=0))
+            return found
+
+    monkeypatch.setattr("heatsplat.export.basis.EXAMINED", 50)
+    monkeypatch.setattr("heatsplat.export.basis.ROWS", 128)
+    with Sizes():
+        found = time_basis(many(count, odd=())[0], count, 0.0, 1.0, 1e-3, most_times=65)
+    assert found.rank >= 2 and max(sizes) < count * (found.rank + 2) < count * CHECKS
 
 
 def test_what_is_not_found_in_time_is_told(monkeypatch):

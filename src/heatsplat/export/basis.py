@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -286,17 +286,25 @@ def _fit(basis: TimeBasis, fitted: Mapping[float, Tensor]) -> TimeBasis:
     """The basis with levels and rounded coefficients of all Gaussians by least squares, of values [N] at some moments."""
     at = _level_and_curves(basis, fitted)
     solving = torch.linalg.pinv(at.double())
-    values = torch.stack(list(fitted.values()), dim=1)
-    found = torch.cat([(some.double() @ solving).float() for some in values.split(ROWS)])
+    found = torch.cat([(some.double() @ solving).float() for some in _by_rows(fitted)])
     return replace(basis, offsets=found[:, 0].contiguous(), coefficients=_rounded(found[:, 1:].T, basis.step).T)
 
 
 def _errors(basis: TimeBasis, known: Mapping[float, Tensor], errors: Callable) -> Tensor:
     """The largest error [N] of each Gaussian at moments of which values [N] are known."""
-    at, true = _level_and_curves(basis, known), torch.stack(list(known.values()), dim=1)
-    own = torch.cat([basis.offsets[:, None], basis.coefficients], dim=1)
-    parts = zip(own.split(ROWS), true.split(ROWS), strict=True)
-    return torch.cat([errors(some @ at, values).amax(1) for some, values in parts])
+    at = _level_and_curves(basis, known)
+    own = zip(basis.offsets.split(ROWS), basis.coefficients.split(ROWS), strict=True)
+    parts = (
+        (torch.cat([level[:, None], some], dim=1) @ at, true)
+        for (level, some), true in zip(own, _by_rows(known), strict=True)
+    )
+    return torch.cat([errors(found, true).amax(1) for found, true in parts])
+
+
+def _by_rows(known: Mapping[float, Tensor]) -> Iterator[Tensor]:
+    """Values [N] at M moments as tables [ROWS, M], one after the other: the whole table of millions takes gigabytes."""
+    for some in zip(*(values.split(ROWS) for values in known.values()), strict=True):
+        yield torch.stack(some, dim=1)
 
 
 def _level_and_curves(basis: TimeBasis, moments: Iterable[float]) -> Tensor:
