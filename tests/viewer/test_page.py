@@ -511,6 +511,22 @@ def by_another_clock(path: Path, later_s: float) -> tuple[dict, bytes]:
     return header, bytes(content)
 
 
+def test_a_second_run_of_coarser_images_has_the_blur_of_its_own_pixels(new_page, folder, tmp_path):
+    header, block = parts_of(folder / FILE)
+    blur, wide = 2.0, 4  # pixels² of a fine image, and how many of its pixels one of a coarse image is wide
+    for camera in header["cameras"]:
+        camera["width"], camera["height"] = camera["width"] / wide, camera["height"] / wide
+        camera["intrinsics"] = [value / wide for value in camera["intrinsics"]]
+    header["renderer"] |= {"antialiased": False, "eps2d": blur / wide**2}
+    (tmp_path / FILE).write_text(pages.page(header, block), encoding="utf-8")
+    new_page.execute_script(f"Object.assign(viewer.told.renderer, {{antialiased: false, eps2d: {blur}}})")
+    new_page.find_element("id", "run").send_keys(str(tmp_path / FILE))
+    wait_until(new_page, "viewer.run && viewer.run.scene.ready")
+    new_page.execute_script("viewer.choose({how: 'difference'}); viewer.frame(performance.now())")
+    values = np.array(new_page.execute_script("return viewer.sampled()"))
+    assert len(values) > 1000 and np.abs(values).max() < 0.01
+
+
 def test_a_second_run_is_itself_whatever_its_clock(new_page, folder, tmp_path):
     header, block = by_another_clock(folder / FILE, 431.0)
     (tmp_path / FILE).write_text(pages.page(header, block), encoding="utf-8")

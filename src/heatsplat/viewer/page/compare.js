@@ -34,6 +34,13 @@ function doubts(own, told) {
   return found;
 }
 
+// How many pixels of a run's images one of another run's is wide (trained at another data.downscale), by a camera that both know, else
+// by the first of each.
+function pixelIn(own, told) {
+  const known = new Map(own.cameras.map((one) => [one.name, one])), there = told.cameras.find(({ name }) => known.has(name)) || told.cameras[0];
+  return (known.get(there.name) || own.cameras[0]).intrinsics[0] / there.intrinsics[0];
+}
+
 // What its page holds; an error where its values cannot be compared.
 async function readRun(file, own) {
   const payload = await readPayload(new DOMParser().parseFromString(await file.text(), "text/html")), { unit } = payload.told;
@@ -53,6 +60,7 @@ class SecondRun {
     this.drawing = viewer.drawing;
     this.splats = new Splats(payload);
     this.scene = this.drawing.load(this.splats);
+    this.scene.pixel = pixelIn(viewer.told, this.told);
     this.sorter = new Sorter(this.splats, (ids) => {
       this.drawing.order(this.scene, ids);
       viewer.request();

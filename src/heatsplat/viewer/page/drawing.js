@@ -216,7 +216,7 @@ class Drawing {
       return this.texture(gl.RGBA32F, WIDTH, rows, gl.RGBA, gl.FLOAT, content);
     };
     const { means, scales, quats, opacities, colours, colourOpacities } = splats;
-    const scene = { splats, rows, seen: 0, ready: false };
+    const scene = { splats, rows, seen: 0, ready: false, pixel: 1 };  // pixel: how wide one of its images is, in those of the view's camera
     scene.places = four((to, j, i) => to.set([means[3 * i], means[3 * i + 1], means[3 * i + 2], opacities[i]], j));
     scene.turns = four((to, j, i) => to.set(quats.subarray(4 * i, 4 * i + 4), j));
     scene.sizes = four((to, j, i) => to.set([scales[3 * i], scales[3 * i + 1], scales[3 * i + 2], colourOpacities ? colourOpacities[i] : 0], j));
@@ -293,7 +293,7 @@ class Drawing {
     gl.useProgram(program);
     const { camera, scale, left, top } = view;
     const [fx, fy, cx, cy] = camera.intrinsics;
-    const { antialiased } = scene.splats.told.renderer, blur = blurOn(scene.splats.told.renderer, scale);
+    const { antialiased } = scene.splats.told.renderer, blur = blurOn(scene.splats.told.renderer, scale * scene.pixel);
     const margin = FOV_MARGIN * 0.5;
     const edges = [Math.min(-cx - margin * camera.width, -cx - left / scale) / fx,
       Math.max(camera.width - cx + margin * camera.width, (width - left) / scale - cx) / fx,
