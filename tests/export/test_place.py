@@ -86,6 +86,25 @@ def test_tables_as_programs_write_them_and_images_of_one_name(cooling, tmp_path)
         place_of(twice, path)
 
 
+def test_rows_that_tell_no_position_are_left_out_of_a_table_and_names_may_hold_points(cooling, tmp_path):
+    scene, spot = cooling.module.scene, torch.zeros(1, 3)
+    expected = place_of(scene, table(scene, tmp_path / "a.csv"))(spot)
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    blanks = ["x.png, , ,5", "y.png,nan,nan,5", "z.png,0.0,0.0,5", "w.png", "v.png,47,9,5,beyond,the,columns"]
+    (tmp_path / "b.csv").write_text("\n".join([lines[0], *blanks, *lines[1:]]) + "\n")
+    assert torch.allclose(place_of(scene, tmp_path / "b.csv")(spot), expected)
+    clocks = {frame.name: f"2024-08-06_17.34.{i:02d}" for i, frame in enumerate(scene.frames)}
+    frames = [replace(frame, name=f"{clocks[frame.name]}.tiff") for frame in scene.train.frames]
+    none = ViewSet([], list)
+    named = replace(scene, train=ViewSet(frames, lambda i: None), val=none, test=none)
+    renamed = [",".join([clocks[line.partition(",")[0]], line.partition(",")[2]]) for line in lines[1:]]
+    (tmp_path / "c.csv").write_text("\n".join([lines[0], *renamed]) + "\n")
+    assert torch.allclose(place_of(named, tmp_path / "c.csv")(spot), expected, atol=1e-3)
+    (tmp_path / "d.csv").write_text("\n".join([*lines, "other.png,147,9,500"]) + "\n")
+    with pytest.raises(SceneError, match="other lies nowhere on the earth, at latitude 147 and longitude 9"):
+        place_of(scene, tmp_path / "d.csv")
+
+
 def test_the_scene_s_own_table_is_taken_unless_it_places_nothing(cooling, tmp_path, caplog):
     scene = replace(cooling.module.scene, positions=table(cooling.module.scene, tmp_path / "frames.csv"))
     assert place_of(scene, "auto").crs == "EPSG:32632" and place_of(scene).crs is None

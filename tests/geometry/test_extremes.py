@@ -84,3 +84,11 @@ def test_what_one_look_alone_puts_behind_a_wall_is_no_surface():
     blind = [Look(one.camera, torch.full_like(one.depth, torch.inf), one.values) for one in cool]
     (hot, *_), _ = extremes([*blind, Look(wrong.camera, depth, wrong.values)], share=0.03)
     assert hot.mean == pytest.approx(40.0) and hot.centre[2].item() == pytest.approx(5.0, abs=0.03)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_all_of_a_scene_may_count_as_hot_and_as_cold(seed):
+    seen, generator = look(0.0), torch.Generator().manual_seed(seed)
+    rough = Look(seen.camera, seen.depth * (1 + 0.01 * torch.rand(120, 160, generator=generator)), seen.values)
+    hot, cold = extremes([rough, rough], share=1.0)
+    assert hot[0].mean == pytest.approx(cold[0].mean) and hot[0].area > 10

@@ -8,7 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
@@ -235,18 +235,20 @@ def _grid_north(warp: Any, crs: str, latitude: float, longitude: float) -> tuple
 
 def _named(frames: Sequence[Frame], positions: Mapping[str, Any]) -> list[str | None]:
     """By which name the position of each image is known: its own, or that of its file where no other has it."""
-    stems = Counter(Path(name).stem for name in positions)
-    alone = {stem: name for stem, name in ((Path(name).stem, name) for name in positions) if stems[stem] == 1}
-    ours = Counter(Path(frame.name).stem for frame in frames)
+    stems = Counter(PurePosixPath(name).name for name in positions)
+    alone = {stem: name for stem, name in ((PurePosixPath(name).name, name) for name in positions) if stems[stem] == 1}
+    ours = Counter(PurePosixPath(_without_ending(frame.name)).name for frame in frames)
     found = []
     for frame in frames:
-        whole, stem = Path(frame.name).with_suffix("").as_posix(), Path(frame.name).stem
+        whole = _without_ending(frame.name)
+        stem = PurePosixPath(whole).name
         found.append(whole if whole in positions else alone.get(stem) if ours[stem] == 1 else None)
     return found
 
 
 def _positions(path: Path, flat: bool = False) -> dict[str, tuple[float, float, float]]:
-    """Latitude, longitude and height by name without ending; rows without a position are left out.
+    """Latitude, longitude and height by name without ending; rows without a position are left out, as are those of latitude and
+    longitude 0, which receivers tell until they know better.
 
     Heights are those of the first column that has any: a preparation writes a column for each kind, empty where files do not
     say it. ``flat`` takes 0 where none has.
@@ -258,8 +260,10 @@ def _positions(path: Path, flat: bool = False) -> dict[str, tuple[float, float, 
             rows = list(csv.DictReader(file, delimiter=max(",;\t", key=head.count)))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SceneError(f"{path} cannot be read: {error}") from error
-    there = rows[0].keys() if rows else ()
-    filled = {column for column in there if any(row[column] for row in rows)}
+    there = (
+        [column for column in rows[0] if column is not None] if rows else []
+    )  # None: of what is beyond the last column
+    filled = {column for column in there if any(_told(row, column) for row in rows)}
     columns = []
     for wanted in (NAMES, LATITUDES, LONGITUDES, HEIGHTS):
         found = [column for column in wanted if column in there]
@@ -273,10 +277,28 @@ def _positions(path: Path, flat: bool = False) -> dict[str, tuple[float, float, 
         columns.append(column or found[0])
     name, *numbers = columns
     try:
-        return {
-            Path(row[name]).with_suffix("").as_posix(): tuple(float(row[n].replace(",", ".")) for n in numbers)
+        found = {
+            _without_ending(row[name]): tuple(float(_told(row, n).replace(",", ".")) for n in numbers)
             for row in rows
-            if all(row[n] for n in numbers)
+            if all(_told(row, n) for n in columns)
         }
     except ValueError as error:
         raise SceneError(f"{path}: {error} in {', '.join(numbers)}") from error
+    found = {name: place for name, place in found.items() if all(map(math.isfinite, place)) and any(place[:2])}
+    if wrong := [
+        name for name, (latitude, longitude, _) in found.items() if abs(latitude) > 90 or abs(longitude) > 360
+    ]:
+        raise SceneError(f"{path}: {wrong[0]} lies nowhere on the earth, at latitude {found[wrong[0]][0]:g} and longitude "
+                         f"{found[wrong[0]][1]:g} degrees")  # fmt: skip
+    return found
+
+
+def _told(row: Mapping[str, str | None], column: str) -> str:
+    """What a row says in a column, which short rows lack; empty for blanks."""
+    return (row[column] or "").strip()
+
+
+def _without_ending(name: str) -> str:
+    """A file's name without its ending, which begins with a letter: that of "2024-08-06_17.34.49" has none."""
+    path = PurePosixPath(Path(name.strip()).as_posix())
+    return (path.with_suffix("") if path.suffix[1:2].isalpha() else path).as_posix()

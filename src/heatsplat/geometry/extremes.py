@@ -70,7 +70,8 @@ def extremes(
     cell = CELLS * widths.median().item()
     order = values.argsort()
     reached = areas[order].cumsum(0) / areas.sum()
-    low, high = (values[order[int((reached < part).sum())]] for part in (share, 1 - share))
+    # The whole may be a little less than 1, by rounding.
+    low, high = (values[order[min(int((reached < part).sum()), len(order) - 1)]] for part in (share, 1 - share))
     return tuple(
         _joined(points[chosen], areas[chosen], values[chosen], cell, count, sign)
         for chosen, sign in ((values >= high, 1), (values <= low, -1))
