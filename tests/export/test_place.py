@@ -193,6 +193,29 @@ def test_without_positions_up_is_known_and_axes_are_at_right_angles(cooling):
     assert torch.allclose(along[2], torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
 
 
+@pytest.mark.parametrize("metres", [0.0, 1e-4, 3.0])
+def test_gps_that_has_nothing_to_do_with_the_cameras_places_nothing(cooling, tmp_path, caplog, metres):
+    """Of a walk about a machine: one fix for all images, or fixes that are metres off. Scale and turn were those of its noise."""
+    scene = replace(cooling.module.scene, metres_per_unit=None)
+    noise = metres / 1e5 * torch.randn(len(scene.frames), 2, generator=torch.Generator().manual_seed(0)).double()
+    lines = [f"{f.name},{47 + y:.12f},{9 + x:.12f},500" for f, (y, x) in zip(scene.frames, noise.tolist(), strict=True)]
+    (tmp_path / "a.csv").write_text("\n".join(["file,lat,lon,alt", *lines]) + "\n")
+    with pytest.raises(SceneError, match=r"does not place the cameras: at best they lie .* m from its positions"):
+        place_of(scene, tmp_path / "a.csv")
+    assert placed(replace(scene, positions=tmp_path / "a.csv")) is None and "does not place the cameras" in caplog.text
+
+
+def test_cameras_at_one_place_are_placed_by_no_gps(cooling, tmp_path):
+    scene = cooling.module.scene
+    still = [replace(frame, camera=scene.train.frames[0].camera) for frame in scene.train.frames]
+    none = ViewSet([], list)
+    fixed = replace(scene, train=ViewSet(still, lambda i: None), val=none, test=none)
+    path = table(scene, tmp_path / "a.csv")
+    with pytest.raises(SceneError, match="does not place the cameras: all points lie at one place"):
+        place_of(fixed, path)
+    assert placed(replace(fixed, positions=path)) is None
+
+
 def test_a_table_that_places_nothing_is_refused(cooling, tmp_path):
     scene = cooling.module.scene
     with pytest.raises(SceneError, match="has no column latitude_deg or"):

@@ -30,6 +30,7 @@ NAMES, LATITUDES, LONGITUDES = (SPELLINGS[key] for key in ("name", "latitude_deg
 HEIGHTS = ("above_takeoff_m", "altitude_m", "altitude", "rel_alt", "alt")
 LEVEL = "no height"  # column that stands for them where a table has none
 AUTO = "auto"
+LOOSE = 0.7  # share of how far positions are from their middle by which cameras may be off them (rms): half of their variance
 LEAST_SPREAD = 0.1  # positions whose second extent is below this share of the first lie on a line
 AXES = "east, north, up"  # of a world whose axes preparation has set by GPS (``notes["axes"]``)
 ONE_WAY = 0.95  # length of the mean viewing direction from which on all cameras look the same way
@@ -191,7 +192,7 @@ def _placed(scene: SceneData, path: Path) -> Place:
             "second strip beside it would tell it; prepare.py, run again, notes the axes of a folder that it has placed by GPS"
         )
     else:
-        similarity = similarity_between(source, target)
+        similarity = _fitted(path, source, target)
     off = similarity(source) - target
     # By what the world may be tipped about the line of flight, as far below it as the ground is.
     height = (similarity(source)[:, 2].median() - similarity(scene.points.double())[:, 2].median()).abs().item()
@@ -202,6 +203,27 @@ def _placed(scene: SceneData, path: Path) -> Place:
         path, len(found), crs, off.square().sum(1).mean().sqrt().item(), height, tipped,
     )  # fmt: skip
     return Place(similarity, crs, "metre")
+
+
+def _fitted(path: Path, source: Tensor, target: Tensor) -> Similarity:
+    """The similarity that brings cameras [n, 3] closest to their positions [n, 3].
+
+    Raises:
+        SceneError: they have little to do with each other, such as those of a walk about a machine with GPS that is metres off,
+            or all are at one place: any scale and turn would do.
+    """
+    apart = (target - target.mean(0)).square().sum(1).mean().sqrt().item()
+    try:
+        similarity = similarity_between(source, target)
+    except ValueError as error:
+        raise SceneError(f"{path} does not place the cameras: {error}") from error
+    off = (similarity(source) - target).square().sum(1).mean().sqrt().item()
+    if not off < LOOSE * apart:
+        raise SceneError(
+            f"{path} does not place the cameras: at best they lie {off:.2g} m from its positions, which are only {apart:.2g} m "
+            "from their middle (rms). GPS is metres off, and the scene may be too small for it"
+        )
+    return similarity
 
 
 def _east_north_up(scene: SceneData) -> bool:
