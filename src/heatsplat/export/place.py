@@ -282,9 +282,8 @@ def _positions(path: Path, flat: bool = False) -> dict[str, tuple[float, float, 
             rows = list(csv.DictReader(file, delimiter=max(",;\t", key=head.count)))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SceneError(f"{path} cannot be read: {error}") from error
-    there = (
-        [column for column in rows[0] if column is not None] if rows else []
-    )  # None: of what is beyond the last column
+    # Without None, under which stands what a row has beyond the last column.
+    there = [column for column in rows[0] if column is not None] if rows else []
     filled = {column for column in there if any(_told(row, column) for row in rows)}
     columns = []
     for wanted in (NAMES, LATITUDES, LONGITUDES, HEIGHTS):
