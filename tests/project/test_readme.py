@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from camera_files import temperatures
 from commands import Done, in_turn, python
-from running import LOOKS, NO_PICTURES, compose_run
+from running import NO_PICTURES, compose_run
 
 from heatsplat import cli
 
@@ -39,7 +39,8 @@ LONG = (
     "trajectory=view",
 )
 LASTING = [command for command in PYTHON if any(word in command for word in LONG)]
-SHORT = ["data.size=tiny", "max_steps=6", LOOKS, "callbacks.probes=null", "callbacks.costs.fps_repeats=1"]
+SHORT = ["data.size=tiny", "max_steps=6", "trainer.val_check_interval=3", "callbacks.probes=null"]
+SHORT += ["callbacks.costs.fps_repeats=1"]
 UNSEEN = ["callbacks.images=null", "callbacks.viewer=null", *NO_PICTURES]  # files that no test here looks at
 FIRST = "python src/train.py method=etgs"
 
