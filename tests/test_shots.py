@@ -18,6 +18,7 @@ from heatsplat.shots import (
     ShotFiles,
     checked_unseen,
     deviations_told,
+    file_stems,
     shot_frames,
     sightings,
     warn_beyond_record,
@@ -271,6 +272,20 @@ def test_a_view_is_named_with_its_folder_where_the_name_alone_is_not_enough():
     )
     with pytest.raises(SceneError, match="view '1.png' may be left/1.png, right/1.png: name it with its folder"):
         shot_frames(scene, "view", 0.0, "1.png", 1)
+
+
+@pytest.mark.parametrize(
+    ("names", "stems"),
+    [
+        (["left/1.png", "right/2.png"], ["1", "2"]),
+        (["left/1.png", "right/1.png"], ["left_1", "right_1"]),
+        (["17.34.49", "17.34.50"], ["17.34.49", "17.34.50"]),  # names without an ending
+        (["1.png", "1.jpg"], ["1.png", "1.jpg"]),
+        (["a_b/c.png", "a/b/c.png", "d.png"], ["a_b_c.png_0", "a_b_c.png_1", "d.png_2"]),
+    ],
+)
+def test_files_of_no_two_frames_have_one_name(names, stems):
+    assert list(file_stems(names).items()) == list(zip(names, stems, strict=True))
 
 
 def test_images_of_one_name_have_files_of_their_own(tmp_path):

@@ -353,8 +353,23 @@ def _write_table(path: Path, rows: Sequence[tuple[str, float | None, float, floa
 
 
 def file_stems(names: Sequence[str]) -> dict[str, str]:
-    """What the files of frames are called, by name of the frame: with their folders where the names alone are not enough."""
-    stems = {name: Path(name).stem for name in names}
-    if len(set(stems.values())) == len(stems):
-        return stems
-    return {name: Path(name).with_suffix("").as_posix().replace("/", "_") for name in names}
+    """What the files of frames are called, by name of the frame, each another: with their folders, endings and numbers only where
+    they would be alike without."""
+    found: dict[str, str] = {}
+    for stem_of in (_stem, _with_folders, _whole):
+        found = {name: stem_of(Path(name)) for name in names}
+        if len(set(found.values())) == len(found):
+            return found
+    return {name: f"{stem}_{number}" for number, (name, stem) in enumerate(found.items())}
+
+
+def _stem(path: Path) -> str:
+    return path.stem
+
+
+def _with_folders(path: Path) -> str:
+    return _whole(path.with_suffix(""))
+
+
+def _whole(path: Path) -> str:
+    return path.as_posix().replace("/", "_")
