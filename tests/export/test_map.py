@@ -143,6 +143,11 @@ def test_a_map_that_lies_elsewhere_is_told_or_refused(cooling, tmp_path, caplog)
         SceneError, match="a.tif has 60 x 60 pixels of 0.1 from .-3, 3. on, this map 60 x 60 .* from .-2, 3. on"
     ):
         Map(**settings, bounds=[-2, -3, 4, 3], against=tmp_path / "a.tif").write(discs, tmp_path / "c.tif")
+    with rasterio.open(tmp_path / "a.tif", "r+") as file:
+        file.set_band_description(1, "value")  # as of a run on greys
+    with pytest.raises(SceneError, match=r"a.tif is a map of value, this one of temperature \[deg C\]"):
+        Map(**settings, bounds=[-3, -3, 3, 3], against=tmp_path / "a.tif").write(discs, tmp_path / "c.tif")
+    assert not (tmp_path / "c.tif").exists()
 
 
 @pytest.mark.parametrize(

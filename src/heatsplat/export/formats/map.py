@@ -99,6 +99,12 @@ class Map(Format):
             )
         camera = _from_above(scene, place, west, north, pixel, width, height)
         depth, bands = self._bands(moment, camera)
+        title = next(iter(bands))
+        if other is not None and other.title not in (None, title):
+            raise SceneError(
+                f"what.against={self.against} is a map of {other.title}, this one of {title}: give maps of two runs on "
+                "temperatures, or of two on greys"
+            )
         log.info("map of %d x %d pixels of %.3g %s", width, height, pixel, place.unit)
         with rasterio.open(
             path,
@@ -218,6 +224,7 @@ class _Other:
     scene: str
     values: np.ndarray
     grid: Any
+    title: str | None  # what the band holds, where heatsplat wrote it
 
 
 def _other(rasterio: Any, path: Path) -> _Other:
@@ -225,7 +232,10 @@ def _other(rasterio: Any, path: Path) -> _Other:
     try:
         with rasterio.open(path) as file:
             tags = file.tags()
-            return _Other(tags.get("method", path.stem), tags.get("scene", path.stem), file.read(1), file.transform)
+            title = file.descriptions[0] if "layer" in tags else None
+            return _Other(
+                tags.get("method", path.stem), tags.get("scene", path.stem), file.read(1), file.transform, title
+            )
     except rasterio.errors.RasterioIOError as error:
         raise SceneError(f"what.against={path} cannot be read: {error}") from error
 
