@@ -99,7 +99,7 @@ class Map(Format):
             )
         camera = _from_above(scene, place, west, north, pixel, width, height)
         depth, bands = self._bands(moment, camera)
-        title = next(iter(bands))
+        title, own = next(iter(bands.items()))
         if other is not None and other.title not in (None, title):
             raise SceneError(
                 f"what.against={self.against} is a map of {other.title}, this one of {title}: give maps of two runs on "
@@ -133,7 +133,7 @@ class Map(Format):
                 method=_method(moment),
                 scene=scene.name,
             )
-        own, unit = next(iter(bands.values())), moment.seen.unit
+        unit = moment.seen.unit
         if other is None:
             write_png(path.with_suffix(".png"), _picture(own, moment, place, pixel))
             return
