@@ -58,6 +58,18 @@ def test_observations_leave_out_what_does_not_count():
     assert (seen.tracks.positions[counted, 0, 0] > -0.25).all() and not counted.all()
 
 
+def test_a_point_beside_a_pixel_that_does_not_count_takes_no_share_of_it():
+    masks = torch.ones(6, HEIGHT, WIDTH, dtype=torch.bool)
+    masks[:, ::4, ::4] = False
+    images = torch.where(masks, 0.5, -9.0).double()
+    viewmats = torch.eye(4).repeat(6, 1, 1)
+    viewmats[:, 0, 3] = torch.linspace(-0.5, 0.5, 6)
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([4.0, 3.0, 0.5])
+    tracks = observe(scene(list(viewmats), images, masks, points - torch.tensor([2.0, 1.5, -5.0]))).tracks
+    seen = tracks.weights > 0
+    assert 100 < int(seen.sum()) < seen.numel() and float((tracks.values[seen] - 0.5).abs().max()) < 1e-9
+
+
 def test_the_border_of_a_mask_is_no_edge_of_the_scene():
     images, masks = filled(6)
     evidence = point_spread(Inspection(scene([torch.eye(4)] * 6, images, masks)))

@@ -254,11 +254,11 @@ def tracks_of(
         inside = inside & ~_hidden(pixels, local[:, 2], inside, cell, width)
         pixels, inside, centre = pixels[followed], inside[followed], camera.center
         line, column = pixels[:, 1].clamp(0, height - 1).long(), pixels[:, 0].clamp(0, width - 1).long()
-        if masks is not None:
-            inside = inside & masks[f, line, column]
         towards = centre - points[followed]
         distance = towards.norm(dim=1)
         position = 2.0 * pixels / extent - 1.0
+        if masks is not None:
+            inside = inside & counted_between(masks[f], position)
         columns["values"].append(between(image[..., None], position)[:, 0])
         columns["slopes"].append(_steepest(image, line, column, noise))
         columns["weights"].append(inside.double())
@@ -310,6 +310,11 @@ def between(image: Tensor, positions: Tensor) -> Tensor:
         image.permute(2, 0, 1)[None], positions[None, None], mode="bilinear", padding_mode="border", align_corners=False
     )
     return found[0, :, 0].T
+
+
+def counted_between(mask: Tensor, positions: Tensor) -> Tensor:
+    """Whether all pixels count of which ``between`` has a share at positions [n, 2], [n] bool, by a mask [H, W] bool."""
+    return between((~mask)[..., None].to(positions), positions)[:, 0] == 0
 
 
 def slopes(image: Tensor, positions: Tensor) -> Tensor:

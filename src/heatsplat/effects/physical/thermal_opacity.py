@@ -10,7 +10,7 @@ from torch import Tensor
 from heatsplat.contracts import SceneData, evenly_spread
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.observations import MAX_FRAMES, MIN_FRAMES, NEARER, between
+from heatsplat.effects.observations import MAX_FRAMES, MIN_FRAMES, NEARER, between, counted_between
 from heatsplat.geometry.projection import to_camera, to_pixels
 
 MAX_POINTS = 6000
@@ -79,11 +79,10 @@ def _votes(scene: SceneData) -> tuple[Tensor, Tensor] | None:
         pixels = to_pixels(torch.where(ahead[:, None], local, local.new_ones(3)), view.camera.K)
         extent = pixels.new_tensor([view.camera.width, view.camera.height])
         inside[:, f] = ahead & (pixels >= 0.5).all(1) & (pixels <= extent - 0.5).all(1)
-        if view.mask is not None:
-            column, line = pixels.long().clamp_min(0).minimum(extent.long() - 1).T
-            inside[:, f] &= view.mask[line, column]
-        behind[:, f] = _nearer(pixels, local[:, 2], inside[:, f], int(extent[0] / BESIDE_PX) + 2)
         position = (2.0 * pixels / extent - 1.0).float()
+        if view.mask is not None:
+            inside[:, f] &= counted_between(view.mask, position)
+        behind[:, f] = _nearer(pixels, local[:, 2], inside[:, f], int(extent[0] / BESIDE_PX) + 2)
         values[:, f] = between(view.thermal.mean(2, keepdim=True).float(), position)
         colours[:, f] = between(view.rgb.float(), position)
     hidden = behind >= 0
