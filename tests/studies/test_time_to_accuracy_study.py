@@ -7,7 +7,6 @@ import pytest
 import yaml
 from matplotlib.figure import Figure
 
-from heatsplat import cli
 from heatsplat.composition import compose
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
@@ -15,7 +14,6 @@ from heatsplat.studies.time_to_accuracy import study as time_to_accuracy
 from heatsplat.studies.time_to_accuracy.runs import Outcome
 from heatsplat.studies.time_to_accuracy.study import run
 
-CONFIG = Path(cli.CONF) / "study" / "time_to_accuracy.yaml"
 REFERENCE, RECIPES = ["max_steps=800"], {"quick": ["preset=fast"]}
 
 
@@ -192,12 +190,11 @@ def test_missing_runs_are_trained_and_finished_ones_are_not(runs, tmp_path, monk
     (panel,) = run(
         tmp_path / "out", str(runs), REFERENCE, RECIPES | {"other": ["density=proximity", "max_steps=200"]},
         cases={"case": ["method=etgs", "data.scene=heated"]}, lengths=[100, 300, 400], seeds=[0, 2],
-        overrides=["callbacks.images=null", "dtype=float64"],
+        overrides=["dtype=float64"], threads=1,
     )  # fmt: skip
     told = {tuple(text for text in overrides[4:]) for overrides in asked}
     assert all(
-        overrides[:4] == ["callbacks.images=null", "dtype=float64", "method=etgs", "data.scene=heated"]
-        for overrides in asked
+        overrides[:4] == ["threads=1", "dtype=float64", "method=etgs", "data.scene=heated"] for overrides in asked
     )
     assert told == {
         ("max_steps=300", "seed=0"), ("density=proximity", "max_steps=200", "seed=0"),
@@ -234,9 +231,9 @@ def test_what_a_case_says_beside_its_scene_makes_a_panel_and_no_other_recipe(tmp
 
 def test_the_configuration_asks_for_what_there_is():
     """Every recipe of the study composes, on the scene of its comment."""
-    study = yaml.safe_load(CONFIG.read_text())
+    study = compose(["study=time_to_accuracy"], "study")["study"]
     assert compose([*study["reference"], "method=etgs"])["max_steps"] == 30000
-    overrides = [text for text in study["overrides"] if "$" not in text]
+    overrides = study["overrides"]
     for recipe in study["recipes"].values():
         config = compose([*overrides, "method=etgs", "data.scene=heated", *recipe])
-        assert config["max_steps"] <= 30000 and config["callbacks"]["images"] is None
+        assert config["max_steps"] <= 30000 and config["callbacks"]["images"] is config["threads"] is None

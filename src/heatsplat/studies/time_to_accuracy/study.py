@@ -43,6 +43,7 @@ def run(
     lengths: Sequence[int] = (),
     seeds: Sequence[int] = (0,),
     overrides: Sequence[str] = (),
+    threads: int | None = None,
     train: str | None = None,
     outputs: str = "outputs",
 ) -> list[Panel]:
@@ -64,6 +65,7 @@ def run(
         lengths: steps of shorter standard runs.
         seeds: of the runs that are trained.
         overrides: of the runs that are trained; finished runs count as theirs whether they have them or not.
+        threads: CPU threads of the runs that are trained; None: all cores.
         train: path of train.py; None: the installed heatsplat-train.
         outputs: where runs lie.
 
@@ -71,7 +73,8 @@ def run(
         SceneError: the reference has no length, the clock is none, a length is no number of steps, there are cases and no
             seed, a run of the study failed, or there is no finished reference.
     """
-    output_dir, reference, overrides = Path(output_dir), listed(reference), listed(overrides)
+    output_dir, reference = Path(output_dir), listed(reference)
+    overrides = [*([] if threads is None else [f"threads={threads}"]), *listed(overrides)]
     recipes = {name: listed(given) for name, given in recipes.items() if given is not None}
     check_option("study.clock", clock, CLOCKS, SceneError)
     if "max_steps" not in as_dict(reference):
