@@ -164,15 +164,9 @@ def test_titles_say_as_much_as_tells_panels_apart(tmp_path):
 
 def test_names_of_rows_stay_whole_and_say_what_else_differs(tmp_path):
     """Only settings are left out of names, whatever stands in a row's name."""
-    for i, (k, steps) in enumerate(((8, 9), (8, 9), (24, 9), (24, 18))):
-        made(
-            tmp_path / str(i),
-            "etgs",
-            [f"thermal.frequencies={k}", f"max_steps={steps}", f"row='K = {k}'"],
-            [],
-            1.0,
-            30.0,
-        )
+    for i, (k, steps, seed) in enumerate(((8, 9, 0), (8, 9, 1), (24, 9, 0), (24, 18, 0))):
+        own = [f"thermal.frequencies={k}", f"max_steps={steps}", f"row='K = {k}'", f"seed={seed}"]
+        made(tmp_path / str(i), "etgs", own, [], 1.0, 30.0)
     assert names_by_panel(tmp_path) == {
         "cooling": {"etgs, K = 8", "etgs, K = 24, max_steps=9", "etgs, K = 24, max_steps=18"}
     }
@@ -183,16 +177,24 @@ def test_names_of_rows_stay_whole_and_say_what_else_differs(tmp_path):
 def test_runs_that_went_on_and_other_seeds_of_a_scene_are_one_recipe(tmp_path):
     made(tmp_path / "a", "etgs", ["max_steps=9", "seed=0", "data.scene_seed=0"], [], 1.0, 30.0)
     made(tmp_path / "b", "etgs", ["seed=1", "data.scene_seed=1", "max_steps=9", "ckpt=runs/last.ckpt"], [], 1.0, 32.0)
-    made(
-        tmp_path / "c",
-        "etgs",
-        ["test=true", "max_steps=9", "table.scenes=[wall]", "experiment=table_etgs_1"],
-        [],
-        1.0,
-        31.0,
-    )
+    made(tmp_path / "c", "etgs", ["test=true", "max_steps=9", "table.scenes=[wall]", "seed=2"], [], 1.0, 31.0)
     (recipe,) = group(find_runs([tmp_path]))
     assert recipe.name == "etgs max_steps=9" and recipe.count == 3
+
+
+def test_a_seed_that_was_trained_twice_counts_once(tmp_path, caplog):
+    """By the same command on another day, or with its default written out: the last counts."""
+    for name, own, psnr in (("1", [], 30.0), ("2", ["seed=0", "launcher=basic"], 31.0), ("3", ["seed=1"], 33.0)):
+        made(tmp_path / name, "etgs", own, [], 1.0, psnr)
+    (recipe,) = group(find_runs([tmp_path]))
+    assert recipe.values("psnr") == [31.0, 33.0] and f"without {tmp_path / '1'}" in caplog.text
+
+
+def test_what_an_experiment_sets_is_no_seed(tmp_path):
+    """A published table trains with recipe=published, which no override of its runs tells."""
+    made(tmp_path / "a", "etgs", ["max_steps=9", "seed=0"], [], 1.0, 30.0)
+    made(tmp_path / "b", "etgs", ["max_steps=9", "seed=1", "experiment=table_etgs_1"], [], 1.0, 31.0)
+    assert names_by_panel(tmp_path) == {"cooling": {"etgs max_steps=9", "etgs max_steps=9 experiment=table_etgs_1"}}
 
 
 def test_runs_that_differ_in_more_than_their_seeds_are_recipes_of_their_own(tmp_path):

@@ -53,6 +53,40 @@ def test_a_job_that_was_trained_again_counts_once(sweep, caplog):
     assert "2 jobs were trained more than once; each counts once" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("first", "again"),
+    [
+        (["seed=1"], ["seed=1", "launcher=joblib"]),
+        (["seed=1"], ["seed=1", "threads=1"]),
+        ([], ["seed=0"]),
+        (["seed=1", "row=x"], ["seed=1", "row='x'"]),
+        (["seed=1", "data.seed=1"], ["seed=1"]),
+    ],
+)
+def test_a_seed_counts_once_however_it_was_asked_for(first, again, tmp_path):
+    job(tmp_path, 0, first, 30.0)
+    job(tmp_path, 1, again, 31.0)
+    job(tmp_path, 2, [*(text for text in again if "seed=" not in text), "seed=5"], 33.0)
+    (row,) = collect(tmp_path)
+    assert row.values("psnr") == [31.0, 33.0]
+
+
+def test_recordings_of_a_scene_are_seeds_of_their_own(tmp_path):
+    for number, own in enumerate((["data.scene_seed=0"], ["data.scene_seed=1"], ["data.seed=1"])):
+        job(tmp_path, number, ["seed=0", *own], 30.0 + number)
+    (row,) = collect(tmp_path)
+    assert row.count == 3
+
+
+def test_experiments_that_are_swept_are_rows_of_their_own(tmp_path):
+    for number, (name, seed) in enumerate(itertools.product(("one", "two"), (0, 1))):
+        job(tmp_path, number, [f"experiment={name}", f"seed={seed}"], 30.0 + number)
+    assert {row.label: row.mean("psnr") for row in collect(tmp_path)} == {
+        "experiment=one": 30.5,
+        "experiment=two": 32.5,
+    }
+
+
 def test_the_table_is_written_for_people_programs_and_eyes(sweep):
     written = write_sweep(sweep, ["K = 24", "K = 8"], {"K = 24": quoted("etgs", "4", "K=24", ["average"])})
     assert [path.name for path in written] == ["table.md", "table.csv", "table.png"]

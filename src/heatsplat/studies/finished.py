@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import statistics
 from collections import Counter
@@ -15,6 +16,8 @@ import pandas as pd
 from heatsplat.contracts import SceneError
 from heatsplat.io.recorded import CONFIG, OVERRIDES, config_of, overrides_of
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
+
+log = logging.getLogger(__name__)
 
 # Overrides that make no other recipe. runs.resume.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of
 # folders, are among them; the method is named by itself.
@@ -148,6 +151,28 @@ def reason_of(folder: Path) -> str:
     return (named or lines or ["failed"])[-1]
 
 
+def each_seed_once(runs: pd.DataFrame, rows: Sequence[Hashable]) -> pd.DataFrame:
+    """The runs without those that were trained more than once: of each row and seed the last that has results, else the last.
+
+    Args:
+        runs: of ``read_runs``.
+        rows: of each the row that it is of, with its scene.
+    """
+    seeds = [_seeds(run.overrides, run.results) for run in runs.itertuples()]
+    told = runs.assign(which=[*zip(rows, seeds, strict=True)], done=runs["failed"].isna())
+    kept = told.sort_values("done", kind="stable").drop_duplicates("which", keep="last").index
+    if twice := runs.loc[~runs.index.isin(kept), "folder"].tolist():
+        log.warning("%d jobs were trained more than once; each counts once, without %s", len(twice), twice[0])
+    return runs.loc[runs.index.isin(kept)].reset_index(drop=True)
+
+
+def _seeds(overrides: Mapping[str, str], results: RunResults | None) -> tuple[str, str, str]:
+    """Of training, of the order of views and of a synthetic scene."""
+    given = {key.lstrip("+~"): value.strip("'\"") for key, value in overrides.items()}
+    seed = str(given.get("seed", "0") if results is None else results.run.get("seed", given.get("seed", "0")))
+    return seed, given.get("data.seed", seed), given.get("data.scene_seed", "0")
+
+
 # Names ---------------------------------------------------------------------------------------------------------------
 
 
@@ -187,7 +212,8 @@ def told_apart(names: Sequence[Hashable], jobs: Sequence[Mapping[str, str]]) -> 
     """
 
     def is_meant(key: str) -> bool:
-        return not _makes_a_recipe(key) and key not in SEEDS | NAMES and key.partition(".")[0] not in WHOSE_JOB
+        named = SEEDS | NAMES - {"experiment"}  # which sets what no override tells
+        return not _makes_a_recipe(key) and key not in named and key.partition(".")[0] not in WHOSE_JOB
 
     left = [
         {name: f"{key}={value}" for key, value in sorted(own.items()) if is_meant(name := key.lstrip("+~"))}

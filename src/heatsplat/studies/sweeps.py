@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,9 +15,7 @@ from heatsplat.io.recorded import OVERRIDES
 from heatsplat.io.tables import NONE, markdown_table, over_seeds, write_csv
 from heatsplat.metrics.definitions import described, unit_of
 from heatsplat.studies.child_runs import all_rows
-from heatsplat.studies.finished import Runs, read_runs, row_names, settings_of
-
-log = logging.getLogger(__name__)
+from heatsplat.studies.finished import Runs, each_seed_once, read_runs, row_names, settings_of
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
 # Scores and costs in the table, where any job has them; between them stand the scores of own callbacks.
@@ -63,14 +60,9 @@ def collect(folder: Path) -> list[Runs]:
     table = read_runs(sorted((path.parents[1] for path in folder.glob(f"*/{OVERRIDES}")), key=_number))
     if table.empty:
         return []
-    # A grid that got another seed numbers its jobs anew, and trains some of them again: each counts once.
-    jobs = [tuple(sorted(row.overrides.items())) or row.folder for row in table.itertuples()]
-    done_last = table.assign(job=jobs, done=table["failed"].isna()).sort_values("done", kind="stable")
-    kept = done_last.drop_duplicates("job", keep="last").index
-    if len(kept) < len(table):
-        log.warning("%s: %d jobs were trained more than once; each counts once", folder, len(table) - len(kept))
-        table = table.loc[table.index.isin(kept)].reset_index(drop=True)
     table[["name", "other"]] = row_names(table["overrides"], table["scene"])
+    # A grid that got another seed numbers its jobs anew, and trains some of them again.
+    table = each_seed_once(table, [*zip(table["scene"], table["name"], table["other"], strict=True)])
     groups = table.groupby(["scene", "name", "other"], sort=False)
     return [Runs(name, scene, own, other) for (scene, name, other), own in groups]
 
