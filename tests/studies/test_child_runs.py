@@ -15,7 +15,7 @@ from heatsplat.studies.child_runs import OtherSettingsError, all_rows, train_or_
 SCRIPT = """import json, sys
 from pathlib import Path
 from hydra.core.override_parser.overrides_parser import OverridesParser
-settings = dict(text.split("=", 1) for text in sys.argv[1:])
+settings = dict(text.partition("=")[::2] for text in sys.argv[1:])
 place = Path(OverridesParser.create().parse_override("hydra.run.dir=" + settings.pop("hydra.run.dir")).value())
 (place / ".hydra").mkdir(parents=True, exist_ok=True)
 (place / ".hydra" / "overrides.yaml").write_text(json.dumps([f"{k}={v}" for k, v in settings.items()]))
@@ -57,6 +57,16 @@ def test_a_folder_with_a_run_of_other_settings_is_refused(script, tmp_path):
         train_or_read(place, script, ["seed=3", "max_steps=9"], tmp_path / "study")
     with pytest.raises(OtherSettingsError, match=r"\(threads=2\)"):  # whose seconds stand in no table beside others
         train_or_read(place, script, ["seed=3", "max_steps=5", "threads=2"], tmp_path / "study")
+
+
+def test_a_setting_that_is_given_twice_is_the_last_of_them(script, tmp_path):
+    """As a recipe's own interval of validations after that of all runs; what is taken away has no value."""
+    place, wanted = tmp_path / "one", ["max_steps=5", "~logger", "max_steps=9"]
+    for _ in range(2):
+        train_or_read(place, script, wanted, tmp_path)
+    assert (place / "times").read_text() == "once\n"
+    with pytest.raises(OtherSettingsError, match=r"\(max_steps=5, max_steps=9\)"):
+        train_or_read(place, script, wanted[:2], tmp_path)
 
 
 def test_a_report_says_what_all_of_its_runs_have():

@@ -214,6 +214,12 @@ def test_a_word_or_number_is_a_list_of_one():
     assert asked_for({"etgs": knobs}, ["heated"], [0], None) == [(place, overrides)]
 
 
+def test_folders_of_long_knobs_have_names_that_file_systems_take():
+    asked = asked_for("supirgs", "heated", [0, 1], {"teacher": [f"/data/{'deep/' * 60}{name}.pth" for name in "ab"]})
+    places = [place for place, _ in asked]
+    assert len({*places}) == 4 and max(len(place.encode()) for place in places) <= 200
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
