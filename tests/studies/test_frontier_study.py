@@ -16,6 +16,7 @@ from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.studies.frontier import study as frontier
+from heatsplat.studies.frontier.report import markdown
 from heatsplat.studies.frontier.runs import dominated, find_runs, group, seconds_to
 from heatsplat.studies.frontier.study import asked_for, run
 
@@ -188,6 +189,16 @@ def test_a_seed_that_was_trained_twice_counts_once(tmp_path, caplog):
         made(tmp_path / name, "etgs", own, [], 1.0, psnr)
     (recipe,) = group(find_runs([tmp_path]))
     assert recipe.values("psnr") == [31.0, 33.0] and f"without {tmp_path / '1'}" in caplog.text
+
+
+def test_seconds_of_several_numbers_of_threads_are_told(tmp_path):
+    made(tmp_path / "a", "etgs", ["seed=0"], [], 1.0, 30.0)
+    made(tmp_path / "b", "etgs", ["seed=1"], [], 9.0, 31.0)
+    recipes = group(find_runs([tmp_path]))
+    assert "Seconds are of" not in markdown(recipes, {"psnr": [], "mae_c": []})
+    recipes[0].table["results"].iloc[0].run["threads"] = 16
+    told = "compare within one: 16 threads (1 run); 2 threads (1 run).\n"
+    assert told in markdown(recipes, {"psnr": [], "mae_c": []})
 
 
 def test_what_an_experiment_sets_is_no_seed(tmp_path):

@@ -71,6 +71,26 @@ def test_a_seed_counts_once_however_it_was_asked_for(first, again, tmp_path):
     assert row.values("psnr") == [31.0, 33.0]
 
 
+def test_seconds_of_several_machines_or_threads_are_told(sweep):
+    """As of a sweep that went on with another launcher, which gives its jobs other threads."""
+
+    def text(**run):
+        (path,) = sweep.glob(f"*_0_x/{METRICS_FILE}")
+        results = RunResults.read(path)
+        results.run |= run
+        results.write(path)
+        return markdown(collect(sweep), {})
+
+    for number in (1, 2, 3):
+        (path,) = sweep.glob(f"*_{number}_x/{METRICS_FILE}")
+        results = RunResults.read(path)
+        results.run |= {"machine": "EPYC, 4 cores", "threads": 4}
+        results.write(path)
+    assert "Seconds" not in text() + text(machine="EPYC, 4 cores", threads=4)
+    told = "compare within one: EPYC, 4 cores, 1 thread (1 run); EPYC, 4 cores, 4 threads (3 runs)."
+    assert told in text(threads=1)
+
+
 def test_recordings_of_a_scene_are_seeds_of_their_own(tmp_path):
     for number, own in enumerate((["data.scene_seed=0"], ["data.scene_seed=1"], ["data.seed=1"])):
         job(tmp_path, number, ["seed=0", *own], 30.0 + number)

@@ -49,3 +49,12 @@ def test_the_picture_shows_the_ends_whatever_a_reset_throws_back():
     ]
     assert levels == pytest.approx([41.0, 40.8])
     assert "processor seconds" in markdown([panel], "cpu_seconds").partition("\n")[0]
+
+
+def test_seconds_beside_a_reference_of_another_machine_are_told():
+    panel = a_panel()
+    panel.outcomes[:] = [replace(one, on="EPYC, 4 threads") for one in panel.outcomes]
+    assert "Seconds are of" not in markdown([panel], "train_seconds")
+    panel.outcomes[0] = replace(panel.outcomes[0], on="Xeon, 4 threads")
+    told = "within one: EPYC, 4 threads (3 runs); Xeon, 4 threads (1 run).\n"
+    assert told in markdown([panel], "train_seconds")

@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, counted
 from heatsplat.io.recorded import CONFIG, OVERRIDES, config_of, overrides_of
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 
@@ -158,7 +158,7 @@ def each_seed_once(runs: pd.DataFrame, rows: Sequence[Hashable]) -> pd.DataFrame
         runs: of ``read_runs``.
         rows: of each the row that it is of, with its scene.
     """
-    seeds = [_seeds(run.overrides, run.results) for run in runs.itertuples()]
+    seeds = [seeds_of(run.overrides, run.results) for run in runs.itertuples()]
     told = runs.assign(which=[*zip(rows, seeds, strict=True)], done=runs["failed"].isna())
     kept = told.sort_values("done", kind="stable").drop_duplicates("which", keep="last").index
     if twice := runs.loc[~runs.index.isin(kept), "folder"].tolist():
@@ -166,11 +166,28 @@ def each_seed_once(runs: pd.DataFrame, rows: Sequence[Hashable]) -> pd.DataFrame
     return runs.loc[runs.index.isin(kept)].reset_index(drop=True)
 
 
-def _seeds(overrides: Mapping[str, str], results: RunResults | None) -> tuple[str, str, str]:
+def seeds_of(overrides: Mapping[str, str], results: RunResults | None) -> tuple[str, str, str]:
     """Of training, of the order of views and of a synthetic scene."""
     given = {key.lstrip("+~"): value.strip("'\"") for key, value in overrides.items()}
     seed = str(given.get("seed", "0") if results is None else results.run.get("seed", given.get("seed", "0")))
     return seed, given.get("data.seed", seed), given.get("data.scene_seed", "0")
+
+
+def ran_on(results: RunResults) -> str:
+    """The machine and the threads of a run, as far as it tells them."""
+    machine, threads = results.run.get("machine"), results.run.get("threads")
+    return ", ".join(filter(None, [machine, None if threads is None else counted(threads, "thread")]))
+
+
+def clocks(places: Iterable[str]) -> str:
+    """What is said of seconds of runs that ran on several machines or numbers of threads (``ran_on``); empty for one of each."""
+    runs = Counter(place for place in places if place)
+    told = "; ".join(f"{place} ({counted(count, 'run')})" for place, count in sorted(runs.items()))
+    return (
+        f"Seconds are of several machines or numbers of threads, and compare within one: {told}."
+        if len(runs) > 1
+        else ""
+    )
 
 
 # Names ---------------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from heatsplat.io.pictures import literal, series_look
 from heatsplat.io.tables import markdown_table, number
 from heatsplat.metrics.definitions import DEFINITIONS, described
 from heatsplat.studies.child_runs import all_rows
-from heatsplat.studies.finished import NAMES, SEEDS
+from heatsplat.studies.finished import NAMES, SEEDS, clocks, ran_on
 from heatsplat.studies.frontier.runs import SCORES, Recipe, dominated
 
 COLUMNS = ("train_seconds", "psnr", "ssim", "mae_c", "peak_memory_mb", "render_fps", "gaussians")
@@ -91,7 +91,8 @@ def markdown(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]) -
     runs = [one for recipe in recipes for one in recipe.table.itertuples()]
     jobs = [{f"{key}={value}" for key, value in one.overrides.items() if key not in SEEDS | NAMES} for one in runs]
     found = {key: [one.results.run.get(key) for one in runs] for key in ("seed", "threads")}
-    lines = ["# Accuracy against training time", "", all_rows(sorted(set.intersection(*jobs)), **found), ""]
+    about = [all_rows(sorted(set.intersection(*jobs)), **found), clocks(ran_on(one.results) for one in runs)]
+    lines = ["# Accuracy against training time", "", " ".join(filter(None, about)), ""]
     for title, head, rows in tables(recipes, levels):
         lines += [f"## {title}", "", *markdown_table(head, rows, "l" + "r" * (len(head) - 1)), ""]
     return "\n".join([*lines, "![quality against seconds](frontier.svg)", "", LEGEND, ""])

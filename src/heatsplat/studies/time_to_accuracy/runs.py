@@ -13,7 +13,7 @@ import pandas as pd
 
 from heatsplat.io.command_lines import as_dict, key_of
 from heatsplat.metrics.definitions import DEFINITIONS
-from heatsplat.studies.finished import PLACES, settings_of
+from heatsplat.studies.finished import PLACES, ran_on, settings_of
 from heatsplat.studies.frontier.runs import panel_titles, seconds_to
 from heatsplat.studies.options import listed
 
@@ -32,6 +32,7 @@ class Outcome:
         scores: psnr (dB) and mae_c (°C) of the test views.
         gaussians: at its end.
         course: score -> (seconds, value) of the validations in order.
+        on: machine and threads, where they are told.
     """
 
     recipe: str | None
@@ -41,6 +42,7 @@ class Outcome:
     scores: dict[str, float]
     gaussians: float
     course: dict[str, list[tuple[float, float]]]
+    on: str = ""
 
     @property
     def kind(self) -> tuple[str | None, int | None]:
@@ -219,4 +221,4 @@ def _outcome(one: Any, name: str | None, clock: str) -> Outcome | None:
     mae = results.test.get("mae_c")
     scores = {"psnr": psnr} if mae is None else {"psnr": psnr, "mae_c": mae}
     seed = str(results.run.get("seed", one.overrides.get("seed", "0")))
-    return Outcome(name, seed, int(results.run["steps"]), seconds, scores, count, one.course)
+    return Outcome(name, seed, int(results.run["steps"]), seconds, scores, count, one.course, ran_on(results))
