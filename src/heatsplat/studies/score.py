@@ -62,7 +62,7 @@ def score_scene(handed_in: Path, scene: Path, truth: Path, scores: Sequence[str]
         scores: names in ``heatsplat.metrics.definitions.DEFINITIONS``.
 
     Raises:
-        SceneError: views are missing, or a file is no image of temperatures in °C of the right size.
+        SceneError: views are missing or there twice, or a file is no image of temperatures in °C of the right size.
     """
     meta = json.loads((scene / META).read_text(encoding="utf-8"))
     bounds = ThermalRange(meta["min_value"], meta["max_value"])
@@ -103,7 +103,11 @@ def score_scene(handed_in: Path, scene: Path, truth: Path, scores: Sequence[str]
 
 
 def _file(folder: Path, name: str) -> Path | None:
-    return next((path for ending in ENDINGS if (path := folder / f"{name}{ending}").is_file()), None)
+    """The file of a view; None for none. Raises SceneError for several, of which one may be old."""
+    found = [path for ending in ENDINGS if (path := folder / f"{name}{ending}").is_file()]
+    if len(found) > 1:
+        raise SceneError(f"{found[0]} and {found[1].name} are of one view: delete the one that does not count")
+    return found[0] if found else None
 
 
 def checked(path: Path, shape: tuple[int, ...], bounds: ThermalRange) -> np.ndarray:
@@ -152,6 +156,7 @@ def read_submission(folder: Path) -> dict[str, Any]:
     if (
         not isinstance(told, dict)
         or not isinstance(told.get("method"), str)
+        or not (told["method"].strip() and told["method"].isprintable())  # it stands in lines of tables
         or not isinstance(told.get("scenes"), dict)
         or not told["scenes"]
     ):

@@ -92,6 +92,7 @@ def _told(entry: Entry, board: Board, folder: Path | None) -> dict[str, Any]:
         "cost": {name: entry.cost(name) for name in ("seconds", "memory_mb", "gaussians", "steps")},
         "command": entry.command,
         "links": links,
+        "reason": entry.lost,
     }
 
 
