@@ -21,6 +21,7 @@ from running import run
 from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults
+from heatsplat.studies.sweeps import collect
 from heatsplat.training.machine import cores
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -104,6 +105,9 @@ def launched(folder: Path, *jobs: list[str]) -> tuple[list[int], list[JobStatus]
         def _job(self, number, overrides):
             return Job(number, tuple(overrides), folder / str(number), None)
 
+        def write_down(self, job):
+            pass
+
     launcher = Launcher()
     launcher.config = OmegaConf.create(
         {"hydra": {"hydra_logging": None, "verbose": False, "sweep": {"dir": str(folder)}}}
@@ -135,6 +139,28 @@ def test_results_of_other_settings_are_not_a_jobs_own(tmp_path):
     )
     done, failed = JobStatus.COMPLETED, JobStatus.FAILED
     assert launched(tmp_path, *jobs) == ([1, 2], [done, failed, failed])
+
+
+def test_a_job_that_dies_before_it_wrote_anything_is_in_the_table(tmp_path):
+    """As one that is taken out of a queue before it starts, or whose node cannot load what it needs."""
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+    from hydra._internal.utils import create_config_search_path
+
+    from hydra_plugins.heatsplat_launchers._jobs import JobLauncher
+
+    class Launcher(JobLauncher):
+        def outcomes(self, jobs):
+            return iter([RuntimeError("out of memory")] * len(jobs))
+
+    (tmp_path / "train.yaml").write_text("method: 3dgs\nseed: 0\ndata: {scene: cooling}\n")
+    loader = ConfigLoaderImpl(create_config_search_path(str(tmp_path)))
+    settings = [f"hydra.sweep.dir={tmp_path}/sweep", "hydra.sweep.subdir=${hydra:job.num}"]
+    launcher = Launcher()
+    launcher.hydra_context = type("Context", (), {"config_loader": loader})
+    launcher.config = loader.load_configuration("train", settings, RunMode.MULTIRUN)
+    launcher.launch([["method=3dgs", "seed=0"], ["method=3dgs", "seed=1"]], 0)
+    (row,) = collect(tmp_path / "sweep")
+    assert (row.scene, row.label, row.failed) == ("cooling", "3dgs", ["RuntimeError: out of memory"] * 2)
 
 
 @pytest.mark.parametrize("launcher", ["joblib.Joblib", "ray.Ray"])

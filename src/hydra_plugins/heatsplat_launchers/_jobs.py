@@ -22,6 +22,8 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from heatsplat.io.command_lines import as_dict
+from heatsplat.io.files import write_atomically
+from heatsplat.io.recorded import CONFIG, OVERRIDES, overrides_of
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 
 log = logging.getLogger("heatsplat")
@@ -73,7 +75,10 @@ class JobLauncher(Launcher):
             log.info("#%d: %s", job.number, " ".join(filter_overrides(job.overrides)))
         if left:
             for job, outcome in zip(left, self.outcomes(left), strict=True):
-                ended[job.number] = outcome if isinstance(outcome, JobReturn) else _died(job, outcome)
+                if not isinstance(outcome, JobReturn):
+                    self.write_down(job)
+                    outcome = _died(job, outcome)
+                ended[job.number] = outcome
                 failed = ended[job.number].status == JobStatus.FAILED
                 log.info(
                     "#%d %s; %d of %d jobs ended", job.number, "FAILED" if failed else "done", len(ended), len(jobs)
@@ -82,6 +87,15 @@ class JobLauncher(Launcher):
 
     def _job(self, number: int, overrides: Sequence[str]) -> Job:
         return planned(self.hydra_context, self.config, number, overrides)
+
+    def write_down(self, job: Job) -> None:
+        """Writes what a job was to be, unless it came to that itself: the table of a sweep is of folders that say so."""
+        if (job.folder / OVERRIDES).exists():
+            return
+        with composed(self.hydra_context, self.config, job.number, job.overrides) as own:
+            config = OmegaConf.masked_copy(own, [key for key in own if key != "hydra"])
+            write_atomically(job.folder / CONFIG, OmegaConf.to_yaml(config))
+        write_atomically(job.folder / OVERRIDES, OmegaConf.to_yaml(filter_overrides(job.overrides)))
 
     def arguments(self, job: Job) -> tuple[Any, ...]:
         """The arguments with which ``execute`` runs the job in any process; cloudpickle can pickle them."""
@@ -164,7 +178,6 @@ def _configuration(context: HydraContext, config: DictConfig, number: int, overr
 
 def _finished(job: Job) -> JobReturn | None:
     """What a job returned that has results of its settings already, else None."""
-    from heatsplat.io.recorded import overrides_of
     from heatsplat.runs.resume import learned_by
 
     file = job.folder / METRICS_FILE
