@@ -260,6 +260,7 @@ def test_a_knob_that_is_null_is_null_for_its_run():
         (METRICS_FILE, "{", "is not a metrics.json of heatsplat"),
         (METRICS_FILE, '{"run": {"scene": "cooling"}}', "sections are missing or no mappings: test, cost"),
         ("curve.csv", "train_seconds,psnr\n1.0,many\n", "could not convert string to float"),
+        ("curve.csv", "train_seconds,psnr\n1,20\n2,213,22\n", "curve.csv: row 2 has more cells than columns"),
         (".hydra/overrides.yaml", "[", "while parsing"),
     ],
 )

@@ -420,8 +420,11 @@ def test_runs_are_found_in_a_folder_at_any_depth_but_not_within_each_other(tmp_p
         (tmp_path / place).mkdir(parents=True)
         (tmp_path / place / FAILED).write_text("RuntimeError: broken")
     expected = [tmp_path / "a/one", tmp_path / "b/deep/two"]
-    for folders in (tmp_path, str(tmp_path), [str(tmp_path)], expected):
+    for folders in (tmp_path, str(tmp_path), [str(tmp_path)], expected, [tmp_path, tmp_path / "b"]):
         assert read_runs(folders)["folder"].tolist() == expected
+    (tmp_path / "a" / "latest").symlink_to("one")
+    (tmp_path / "b" / "deep" / "above").symlink_to("..")
+    assert read_runs(tmp_path)["folder"].tolist() == expected
     (tmp_path / "empty").mkdir()
     with pytest.raises(SceneError, match="empty holds no run"):
         read_runs([tmp_path / "empty"])

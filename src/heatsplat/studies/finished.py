@@ -78,7 +78,8 @@ class Runs:
 
 
 def read_runs(folders: Iterable[Path | str] | Path | str) -> pd.DataFrame:
-    """A row for each run, in the order of the folders; of a folder that is no run a row for each that lies below it.
+    """A row for each run, in the order of the folders; of a folder that is no run a row for each that lies below it. A run that
+    is reached twice, as by a link to the latest, has one.
 
     Columns: folder, scene, method, row (of a sweep, "" for none), overrides (key -> value), failed (why there are no results,
     None where there are), results (None where there are none), data (the options of the data), then every score of the test
@@ -88,25 +89,36 @@ def read_runs(folders: Iterable[Path | str] | Path | str) -> pd.DataFrame:
         SceneError: a folder is none, or has no run in it.
     """
     places = [folders] if isinstance(folders, Path | str) else folders
-    return pd.DataFrame([_read(run) for place in places for run in _runs_in(Path(place))])
+    runs: dict[Path, Path] = {}
+    for run in (run for place in places for run in _runs_in(Path(place))):
+        runs.setdefault(run.resolve(), run)
+    return pd.DataFrame([_read(run) for run in runs.values()])
 
 
 def _runs_in(place: Path) -> list[Path]:
     if not place.is_dir():
         raise SceneError(f"there is no folder {place}")
-    found = list(_runs_below(place))
+    found = list(_runs_below(place, set()))
     if not found:
         raise SceneError(f"{place} holds no run, nor does any folder below it: a run has {METRICS_FILE} or {OVERRIDES}")
     return found
 
 
-def _runs_below(place: Path) -> Iterator[Path]:
-    """The folder itself where it is one of a run; else those below it, but none within a run, such as of its evaluations."""
+def _runs_below(place: Path, seen: set[Path]) -> Iterator[Path]:
+    """The folder itself where it is one of a run; else those below it, but none within a run, such as of its evaluations.
+
+    Links come last, and those to a folder that was seen, such as the one above, are passed over.
+    """
+    if (real := place.resolve()) in seen:
+        return
+    seen.add(real)
     if any((place / name).exists() for name in (METRICS_FILE, FAILED, OVERRIDES, CONFIG)):
         yield place
         return
-    for inner in sorted(path for path in place.iterdir() if path.is_dir()):
-        yield from _runs_below(inner)
+    for inner in sorted(
+        (path for path in place.iterdir() if path.is_dir()), key=lambda path: (path.is_symlink(), path)
+    ):
+        yield from _runs_below(inner, seen)
 
 
 def _read(folder: Path) -> dict[str, Any]:
