@@ -128,7 +128,7 @@ def test_damaged_results_of_one_job_do_not_keep_the_others_from_running(tmp_path
 def test_results_of_other_settings_are_not_a_jobs_own(tmp_path):
     """The job is run, and refuses its folder by itself; where and how it runs is no other setting."""
     before = ["max_steps=40", "seed=0", "row=a", "threads=1", "callbacks.images=null"]
-    for number in range(3):
+    for number in range(5):
         (tmp_path / str(number) / ".hydra").mkdir(parents=True)
         (tmp_path / str(number) / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(before))
         RunResults().write(tmp_path / str(number) / "metrics.json")
@@ -136,9 +136,11 @@ def test_results_of_other_settings_are_not_a_jobs_own(tmp_path):
         ["seed=0", "max_steps=40", "row=b", "threads=2", "launcher=joblib"],
         ["seed=0", "max_steps=80", "row=a"],
         ["seed=0", "max_steps=40", "+thermal.clip=null"],
+        ["seed=0", "max_steps=40", "callbacks=plateau"],
+        ["seed=0", "max_steps=40", "+trainer.gradient_clip_val=1e-4", "trainer.val_check_interval=9"],
     )
     done, failed = JobStatus.COMPLETED, JobStatus.FAILED
-    assert launched(tmp_path, *jobs) == ([1, 2], [done, failed, failed])
+    assert launched(tmp_path, *jobs) == ([1, 2, 3, 4], [done, *[failed] * 4])
 
 
 def test_a_job_that_dies_before_it_wrote_anything_is_in_the_table(tmp_path):

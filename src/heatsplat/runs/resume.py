@@ -147,8 +147,14 @@ def stored_config(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 def learned_by(overrides: Mapping[str, str]) -> dict[str, str]:
     """Those of the overrides that say what a run learns: not where and how it runs."""
-    without = NOT_LEARNED | {"launcher"}
-    return {key: value for key, value in overrides.items() if key.lstrip("+~").partition(".")[0] not in without}
+
+    def says_it(key: str) -> bool:
+        group, _, name = key.lstrip("+~").partition(".")
+        if group in LEARNED:  # an option of the group, such as callbacks=plateau, may hold it
+            return not name or name.partition(".")[0] in LEARNED[group]
+        return group not in NOT_LEARNED | {"launcher"}
+
+    return {key: value for key, value in overrides.items() if says_it(key)}
 
 
 def shortened(names: Sequence[str]) -> str:
