@@ -16,6 +16,7 @@ from heatsplat.composition import scene_name
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 from heatsplat.runs.resume import NOT_LEARNED
+from heatsplat.studies import sweeps
 from heatsplat.studies.finished import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, read_runs, row_names, settings_of
 from heatsplat.studies.published.figures import quoted
 from heatsplat.studies.sweeps import collect, markdown, picture, write_sweep
@@ -146,7 +147,7 @@ def test_own_scores_are_columns_with_their_units(sweep):
     )
 
 
-def test_scores_of_different_scenes_stand_in_panels_of_their_own(tmp_path):
+def test_scores_of_different_scenes_stand_in_panels_of_their_own(tmp_path, monkeypatch):
     for number, (method, scene) in enumerate([("etgs", "cooling"), ("3dgs", "static")]):
         job(tmp_path, number, [f"method={method}", f"data.scene={scene}"], 30.0 + number, scene=scene)
     assert "No two rows are of one scene" in markdown(collect(tmp_path), {})
@@ -155,6 +156,8 @@ def test_scores_of_different_scenes_stand_in_panels_of_their_own(tmp_path):
     assert "No two rows" not in markdown(rows, {})
     panels = picture(rows).axes
     assert [axes.get_title() for axes in panels] == ["cooling", "cooling", "static", "static"]
+    monkeypatch.setattr(sweeps, "DRAWN", 1)
+    assert len(picture(rows).axes) == 2 and picture(rows).get_suptitle() == "the first 1 of 2 scenes; the table has all"
     labels = [axes.get_legend_handles_labels()[1] for axes in panels]
     assert [len(each) for each in labels] == [2, 2, 1, 1]
 

@@ -21,6 +21,7 @@ TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
 # Scores and costs in the table, where any job has them; between them stand the scores of own callbacks.
 SCORES = ("psnr", "ssim", "lpips", "mae_c", "clean_psnr", "clean_mae_c", "rgb_psnr")
 COSTS = ("train_seconds", "peak_memory_mb", "gaussians", "render_fps")
+DRAWN = 30  # scenes at most in the picture: two hundred take minutes, and few programs show a picture as long
 OWN_DIGITS = 4  # significant ones of the largest value of an own score
 
 Printed = Mapping[str, Mapping[str, str]]  # name of a row -> score or cost -> what a paper prints for it
@@ -152,8 +153,11 @@ def picture(rows: Sequence[Runs]) -> Figure | None:
     shown = [name for name in ("psnr", "mae_c") if any(row.mean(name) is not None for row in rows)]
     if not shown or not any(row.mean("train_seconds") for row in rows):
         return None
-    scenes, labels = list(dict.fromkeys(row.scene for row in rows)), list(dict.fromkeys(row.label for row in rows))
+    every, labels = list(dict.fromkeys(row.scene for row in rows)), list(dict.fromkeys(row.label for row in rows))
+    scenes = every[:DRAWN]
     figure = Figure(figsize=(5.2 * len(shown), 4.2 * len(scenes)), dpi=110, layout="constrained")
+    if len(scenes) < len(every):
+        figure.suptitle(f"the first {len(scenes)} of {len(every)} scenes; the table has all")
     panels = figure.subplots(len(scenes), len(shown), squeeze=False)
     for line, scene in zip(panels, scenes, strict=True):
         for axes, name in zip(line, shown, strict=True):
