@@ -102,6 +102,14 @@ def test_runs_of_other_settings_than_the_track_has_do_not_count(tmp_path):
     )
 
 
+def test_scenes_may_have_names_that_take_quotes(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "Büro, Süd"), tmp_path / "sweep"
+    (job,) = board(root, methods=["3dgs"], seeds=[0]).jobs()
+    assert "data.scene='Büro, Süd'" in job
+    run_of(sweep, "3dgs", "'Büro, Süd'", 0, 1.0)
+    assert [one.seeds for one in standings(sweep, board(root, methods=["3dgs"])).entries] == [1]
+
+
 def test_the_machines_of_seconds_are_told(tmp_path):
     root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
     theirs = str(submission(tmp_path / "theirs", 0.1, machine="RTX 4090"))

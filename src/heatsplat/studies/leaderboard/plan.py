@@ -127,7 +127,7 @@ class Board:
                 f"method={method}",
                 "data=benchmark",
                 setting("data.root", self.root),
-                f"data.scene={scene}",
+                setting("data.scene", scene),
                 f"seed={seed}",
                 *self.protocol["tracks"][track],
                 *own.get(method, ()),

@@ -223,7 +223,8 @@ def _add_run(places: Mapping[Place, Entry], folder: Path, board: Board) -> None:
         log.warning("%s. Delete the folder to run it again.", error)
         return
     overrides = as_dict(told)
-    key = (overrides.get("method", ""), overrides.get("data.scene", ""), overrides.get("leaderboard.track", ""))
+    scene = overrides.get("data.scene", "").strip("'")  # in quotes where Hydra would not take its name as it stands
+    key = (overrides.get("method", ""), scene, overrides.get("leaderboard.track", ""))
     entry = places.get(key)
     seed = int(overrides.get("seed", 0))
     if entry is None or seed not in board.seeds or seed in entry.all_numbers:
