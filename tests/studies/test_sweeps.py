@@ -92,6 +92,21 @@ def test_seconds_of_several_machines_or_threads_are_told(sweep):
     assert told in text(threads=1)
 
 
+def test_runs_of_several_versions_are_told(sweep):
+    """As of a sweep that got another seed after an update."""
+    for number, commit in ((0, "fcb7dfd630"), (1, "fcb7dfd630"), (2, "343e0805aa"), (3, None)):
+        (path,) = sweep.glob(f"*_{number}_x/{METRICS_FILE}")
+        results = RunResults.read(path)
+        results.versions = {"heatsplat": "0.1.0", "git_commit": commit}
+        results.write(path)
+    told = "several versions of heatsplat: 0.1.0 (1 run); 0.1.0 343e0805 (1 run); 0.1.0 fcb7dfd6 (2 runs)."
+    assert told in markdown(collect(sweep), {})
+    for number in (2, 3):
+        (path,) = sweep.glob(f"*_{number}_x/{METRICS_FILE}")
+        path.unlink()
+    assert "several versions" not in markdown(collect(sweep), {})
+
+
 def test_recordings_of_a_scene_are_seeds_of_their_own(tmp_path):
     for number, own in enumerate((["data.scene_seed=0"], ["data.scene_seed=1"], ["data.seed=1"])):
         job(tmp_path, number, ["seed=0", *own], 30.0 + number)

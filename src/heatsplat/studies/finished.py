@@ -193,13 +193,21 @@ def ran_on(results: RunResults) -> str:
 
 def clocks(places: Iterable[str]) -> str:
     """What is said of seconds of runs that ran on several machines or numbers of threads (``ran_on``); empty for one of each."""
-    runs = Counter(place for place in places if place)
-    told = "; ".join(f"{place} ({counted(count, 'run')})" for place, count in sorted(runs.items()))
-    return (
-        f"Seconds are of several machines or numbers of threads, and compare within one: {told}."
-        if len(runs) > 1
-        else ""
-    )
+    return _several("Seconds are of several machines or numbers of threads, and compare within one", places)
+
+
+def versions(results: Iterable[RunResults]) -> str:
+    """What is said of runs of several versions of heatsplat, as of a sweep that went on after an update; empty for one."""
+    told = ([str(one.versions.get(key) or "") for key in ("heatsplat", "git_commit")] for one in results)
+    texts = (f"{number} {commit[:8]}".strip() for number, commit in told)
+    return _several("Runs are of several versions of heatsplat", texts)
+
+
+def _several(what: str, told: Iterable[str]) -> str:
+    """A sentence with each of the texts and how many runs tell it; empty where all that tell one tell the same."""
+    runs = Counter(text for text in told if text)
+    listed = "; ".join(f"{text} ({counted(count, 'run')})" for text, count in sorted(runs.items()))
+    return f"{what}: {listed}." if len(runs) > 1 else ""
 
 
 # Names ---------------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from heatsplat.io.recorded import OVERRIDES
 from heatsplat.io.tables import NONE, markdown_table, over_seeds, write_csv
 from heatsplat.metrics.definitions import described, unit_of
 from heatsplat.studies.child_runs import all_rows
-from heatsplat.studies.finished import Runs, clocks, each_seed_once, ran_on, read_runs, row_names, settings_of
+from heatsplat.studies.finished import Runs, clocks, each_seed_once, ran_on, read_runs, row_names, settings_of, versions
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
 # Scores and costs in the table, where any job has them; between them stand the scores of own callbacks.
@@ -130,8 +130,8 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
         about += (
             " No two rows are of one scene, so their scores are not to be compared: a scene for all is data.scene=NAME."
         )
-    if mixed := clocks(ran_on(found) for row in rows for found in row.table["results"].dropna()):
-        about += f" {mixed}"
+    results = [one for row in rows for one in row.table["results"].dropna()]
+    about = " ".join(filter(None, [about, clocks(map(ran_on, results)), versions(results)]))
     return "\n".join([f"# Sweep on {scenes}", "", about, "", *lines, ""])
 
 
