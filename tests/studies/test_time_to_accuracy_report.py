@@ -24,6 +24,13 @@ def test_seeds_of_a_recipe_are_one_row_whatever_their_lengths():
     assert row.startswith("| budget | 2 | ≈ 306 | 30.0 ± 0.0 |") and "41.00 ± 1.41" in row
 
 
+def test_fields_have_no_gaussians_to_compare():
+    panel = a_panel()
+    panel.outcomes[:] = [replace(one, gaussians=0.0) for one in panel.outcomes]
+    panel.references["0"] = panel.outcomes[-1]
+    assert all(line.endswith("| 0 | – |") for line in ends(panel)[2:])
+
+
 def test_times_have_a_dash_where_the_accuracy_is_not_reached():
     lines = {line.split("|")[1].strip(): line for line in times(a_panel(), "end")}
     assert lines["early"].count("–") == 6

@@ -132,14 +132,18 @@ def test_methods_and_scenes_have_panels_and_references_of_their_own(runs, tmp_pa
     made(runs / "other", ["max_steps=800"], 800, 60.0, 33.0, method="3dgs")
     made(runs / "other_quick", ["preset=fast", "seed=0"], 200, 6.0, 32.0, method="3dgs")
     made(runs / "lone", ["preset=fast", "seed=7"], 200, 6.0, 32.0, method="3dgs")
-    made(runs / "twice", ["preset=fast", "seed=0", "threads=2"], 190, 1.0, 32.0, method="3dgs")
+    made(runs / "before", ["preset=fast", "seed=0", "threads=2"], 190, 1.0, 32.0, method="3dgs")
+    made(runs / "table", ["preset=fast", "seed=1", "experiment=table_etgs_1"], 200, 5.0, 30.0)
     panels = {panel.title: panel for panel in run(tmp_path / "out", str(runs), REFERENCE, RECIPES)}
     assert set(panels) == {"etgs on heated", "3dgs on heated"}
+    names = {one.recipe for one in panels["etgs on heated"].outcomes}
+    assert {"quick", "experiment=table_etgs_1 preset=fast"} <= names  # which sets more
     found = panels["3dgs on heated"]
-    assert [(one.recipe, one.seed, one.seconds) for one in found.outcomes] == [(None, "0", 60.0), ("quick", "0", 6.0)]
+    outcomes = [own for group in found.groups() for own in group]
+    assert [(one.recipe, one.seed, one.seconds) for one in outcomes] == [(None, "0", 60.0), ("quick", "0", 6.0)]
     assert "3dgs on heated, quick, seed 7 is left out: there is no reference with this seed" in caplog.text
-    assert "twice is left out: another run of its recipe and seed" in caplog.text
-    assert found.standard_in(found.outcomes[1]) is None  # one length says nothing of others
+    assert "before is left out: a later run of its recipe and seed counts" in caplog.text
+    assert found.standard_in(outcomes[1]) is None  # one length says nothing of others
 
 
 def test_a_scene_without_temperatures_is_measured_by_psnr_alone(tmp_path, no_pictures):
