@@ -156,7 +156,8 @@ def further_of(overrides: Mapping[str, str], cases: Iterable[Sequence[str]]) -> 
 
 def _told(overrides: Mapping[str, str]) -> list[str]:
     """Settings that make a recipe, and the experiment, which sets what no override tells."""
-    return [*settings_of(overrides), *(f"{key}={overrides[key]}" for key in ("experiment",) if key in overrides)]
+    experiment = overrides.get("experiment")
+    return [*settings_of(overrides), *([] if experiment is None else [f"experiment={experiment}"])]
 
 
 def panels_of(
