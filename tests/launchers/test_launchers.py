@@ -143,24 +143,28 @@ def test_results_of_other_settings_are_not_a_jobs_own(tmp_path):
     assert launched(tmp_path, *jobs) == ([1, 2, 3, 4], [done, *[failed] * 4])
 
 
-def test_a_job_that_dies_before_it_wrote_anything_is_in_the_table(tmp_path):
+def test_a_job_that_dies_before_it_wrote_anything_is_in_the_table(tmp_path, monkeypatch, caplog):
     """As one that is taken out of a queue before it starts, or whose node cannot load what it needs."""
     from hydra._internal.config_loader_impl import ConfigLoaderImpl
     from hydra._internal.utils import create_config_search_path
 
-    from hydra_plugins.heatsplat_launchers._jobs import JobLauncher
+    from hydra_plugins.heatsplat_launchers import _jobs
 
-    class Launcher(JobLauncher):
+    class Launcher(_jobs.JobLauncher):
         def outcomes(self, jobs):
             return iter([RuntimeError("out of memory")] * len(jobs))
 
     (tmp_path / "train.yaml").write_text("method: 3dgs\nseed: 0\ndata: {scene: cooling}\n")
     loader = ConfigLoaderImpl(create_config_search_path(str(tmp_path)))
-    settings = [f"hydra.sweep.dir={tmp_path}/sweep", "hydra.sweep.subdir=${hydra:job.num}"]
+    settings = [f"hydra.sweep.dir={tmp_path}/sweep", "hydra.sweep.subdir=${hydra:job.num}", "hydra/hydra_logging=none"]
+    caplog.set_level("INFO", "heatsplat")
     launcher = Launcher()
     launcher.hydra_context = type("Context", (), {"config_loader": loader})
     launcher.config = loader.load_configuration("train", settings, RunMode.MULTIRUN)
     launcher.launch([["method=3dgs", "seed=0"], ["method=3dgs", "seed=1"]], 0)
+    monkeypatch.setattr(_jobs, "MANY", 2)
+    launcher.launch([["method=3dgs", "seed=0"], ["method=3dgs", "seed=1"]], 0)  # the same once more
+    assert caplog.text.count("composing the settings of 2 jobs") == 1
     (row,) = collect(tmp_path / "sweep")
     assert (row.scene, row.label, row.failed) == ("cooling", "3dgs", ["RuntimeError: out of memory"] * 2)
 

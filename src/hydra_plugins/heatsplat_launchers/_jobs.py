@@ -28,6 +28,8 @@ from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 
 log = logging.getLogger("heatsplat")
 
+MANY = 20  # jobs that take long enough to compose to say so
+
 
 class DiedError(RuntimeError):
     """The process of a job ended before the job did."""
@@ -68,6 +70,8 @@ class JobLauncher(Launcher):
         setup_globals()
         configure_log(self.config.hydra.hydra_logging, self.config.hydra.verbose)
         Path(self.config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
+        if len(job_overrides) >= MANY:
+            log.info("composing the settings of %d jobs, which name their folders", len(job_overrides))
         jobs = [self._job(initial_job_idx + i, overrides) for i, overrides in enumerate(job_overrides)]
         ended = {job.number: done for job in jobs if (done := _finished(job)) is not None}
         left = [job for job in jobs if job.number not in ended]

@@ -21,14 +21,12 @@ from omegaconf import DictConfig, OmegaConf
 from heatsplat.errors import SceneError
 from heatsplat.io.command_lines import keys_of
 from heatsplat.io.files import short_name
-from hydra_plugins.heatsplat_launchers._jobs import JobLauncher, composed, planned
+from hydra_plugins.heatsplat_launchers._jobs import MANY, JobLauncher, composed, planned
 
 if TYPE_CHECKING:
     from heatsplat.studies.sweep_plan import SweepPlan
 
 log = logging.getLogger("heatsplat")
-
-MANY = 20  # jobs that take long enough to compose to say so
 
 LONGEST = 120  # bytes; file systems allow 255, and row, scene and number come with them
 
