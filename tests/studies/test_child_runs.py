@@ -75,12 +75,13 @@ def test_a_report_says_what_all_of_its_runs_have():
     assert all_rows(["threads=1"], threads=[None]) == "All rows: `threads=1`."
 
 
-def test_a_run_that_failed_says_where_and_how_to_go_on(script, tmp_path):
-    place = tmp_path / "study" / "one"
+@pytest.mark.parametrize(("name", "typed"), [("study", "hydra.run.dir={}"), ("my study", "\"hydra.run.dir='{}'\"")])
+def test_a_run_that_failed_says_where_and_how_to_go_on(script, tmp_path, name, typed):
+    place = tmp_path / name / "one"
     with pytest.raises(SceneError, match="unlucky") as failure:
-        train_or_read(place, script, ["seed=13"], tmp_path / "study")
+        train_or_read(place, script, ["seed=13"], tmp_path / name)
     assert f"{place / 'FAILED'} says why" in str(failure.value) and sys.executable in str(failure.value)
-    assert f"hydra.run.dir={tmp_path / 'study'} goes on" in str(failure.value)
+    assert f"{typed.format(tmp_path / name)} goes on" in str(failure.value)
 
 
 def test_a_run_is_told_of_configurations_beside_ours(script, tmp_path, monkeypatch):

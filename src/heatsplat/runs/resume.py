@@ -11,7 +11,7 @@ from typing import Any
 from heatsplat.composition import compose, followed, overlap, run_of
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
-from heatsplat.io.command_lines import keys_of
+from heatsplat.io.command_lines import keys_of, setting, typed
 from heatsplat.io.results import checkpoint_of
 from heatsplat.io.settings import at
 from heatsplat.runs.lock import OccupiedError
@@ -166,17 +166,17 @@ def shortened(names: Sequence[str]) -> str:
 def _check_own(config: dict[str, Any], output_dir: Path, path: Path, checkpoint: Mapping[str, Any]) -> None:
     """Raises OccupiedError where a checkpoint in a run's folder is of other settings."""
     if changed := differences(config, stored_config(checkpoint)):
-        step = checkpoint.get("global_step")
+        step, ckpt = checkpoint.get("global_step"), typed(setting("ckpt", path))
         if len(new_in(config, stored_config(checkpoint), changed)) == len(changed):
             raise OccupiedError(
                 f"{output_dir} holds an unfinished run of an older heatsplat, which did not have "
-                f"{shortened(changed)}: ckpt={path} hydra.run.dir={output_dir} goes on from step {step}, and they "
+                f"{shortened(changed)}: {ckpt} {typed(setting('hydra.run.dir', output_dir))} goes on from step {step}, and they "
                 "count from there on; or delete that folder (of a sweep: that of the job), and the same command trains it anew"
             )
         raise OccupiedError(
             f"{output_dir} holds an unfinished run with other settings ({shortened(changed)}), of which "
             f"{path.name} is of step {step}: give another folder with hydra.run.dir; or go on with that "
-            f"run, with its settings and ckpt={path}; or delete that folder"
+            f"run, with its settings and {ckpt}; or delete that folder"
         )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from heatsplat.composition import further_places
 from heatsplat.contracts import SceneError
-from heatsplat.io.command_lines import as_dict, key_of, setting
+from heatsplat.io.command_lines import as_dict, key_of, setting, typed
 from heatsplat.io.recorded import OVERRIDES, overrides_of
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 
@@ -51,7 +51,7 @@ def train_or_read(place: Path, train: str | None, overrides: Sequence[str], stud
         failed = place / FAILED
         raise SceneError(
             f"a run of the study failed; {failed if failed.exists() else 'its output'} says why. When that is mended, the "
-            f"same command with hydra.run.dir={study} goes on with what is left.\nFolder of the run: {place}\n"
+            f"same command with {typed(setting('hydra.run.dir', study))} goes on with what is left.\nFolder of the run: {place}\n"
             f"Command: {shlex.join(command)}\nOutput:\n{(done.stderr or done.stdout)[-2000:]}"
         )
     return RunResults.read(place / METRICS_FILE)

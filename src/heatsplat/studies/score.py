@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from heatsplat.contracts import SceneError, ThermalRange, check_option, is_number
+from heatsplat.io.command_lines import setting, typed
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.io.tables import markdown_table, number, write_csv
@@ -206,7 +207,7 @@ def scenes_in(root: Path) -> list[str]:
     if not names:
         raise SceneError(
             f"{root} has no scenes/ and truth/ of the protocol; write them: python src/study.py study=scenes "
-            f"study.target={root}"
+            f"{typed(setting('study.target', root))}"
         )
     return names
 
