@@ -102,6 +102,17 @@ def test_runs_of_other_settings_than_the_track_has_do_not_count(tmp_path):
     )
 
 
+def test_scenes_that_are_not_asked_for_are_no_columns(tmp_path):
+    root = protocol_folder(tmp_path / "root", "cooling", "driven")
+    theirs = submission(tmp_path / "theirs", 0.1, scenes={"driven": None, "cooling": None})
+    hand_in(theirs / "driven", 0.1)
+    for scenes in (["cooling"], ["cooling", "driven"]):
+        found = standings(
+            tmp_path / "none", board(root, methods=["3dgs"], scenes=scenes, submissions=[str(theirs)])
+        ).entries
+        assert [one.scene for one in found if one.method == "theirs"] == scenes
+
+
 def test_scenes_may_have_names_that_take_quotes(tmp_path):
     root, sweep = protocol_folder(tmp_path / "root", "Büro, Süd"), tmp_path / "sweep"
     (job,) = board(root, methods=["3dgs"], seeds=[0]).jobs()

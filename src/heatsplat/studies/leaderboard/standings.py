@@ -168,7 +168,7 @@ def standings(folder: Path, board: Board) -> Standings:
     for path in sorted(folder.glob(f"*/{OVERRIDES}")):
         _add_run(places, path.parents[1], board)
     for submission in sorted(board.submissions, key=lambda one: one.seed is None):  # others take what numbers are left
-        for scene, score in submission.scores.items():
+        for scene, score in ((scene, submission.scores[scene]) for scene in board.scenes if scene in submission.scores):
             key = (submission.method, scene, submission.track)
             entry = places.setdefault(key, Entry(*key))
             taken = entry.all_numbers
