@@ -152,7 +152,7 @@ def test_own_scores_are_columns_with_their_units(sweep):
     write_sweep(sweep)
     text = (sweep / "table.md").read_text()
     assert "| PSNR (dB) | MAE (°C) | rmse_c (°C) | steps_seen | train (s) |" in text and "none_at_all" not in text
-    assert "| 0.4623 ± 0.0707 | – |" in text and "| – | 1,234 |" in text
+    assert "| 0.4623 ± 0.0707 | – |" in text and "| – | 1,234 (1 of 2) |" in text
     with open(sweep / "table.csv", newline="") as file:
         first, second, *_ = csv.DictReader(file)
     assert (

@@ -113,7 +113,7 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
             *([row.scene] if several else []),
             row.label,
             row.count,
-            *(over_seeds(row.values(name), digits) for name, (_, digits) in shown.items()),
+            *(_cell(row, name, digits) for name, (_, digits) in shown.items()),
             *(paper.get(row.name, {}).get(name, NONE) for name in printed),
         ]
         for row in rows
@@ -133,6 +133,13 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
     results = [one for row in rows for one in row.table["results"].dropna()]
     about = " ".join(filter(None, [about, clocks(map(ran_on, results)), versions(results)]))
     return "\n".join([f"# Sweep on {scenes}", "", about, "", *lines, ""])
+
+
+def _cell(row: Runs, name: str, digits: int) -> str:
+    """Mean and spread over the seeds, and how many have the value where not all do."""
+    values = row.values(name)
+    few = f" ({len(values)} of {row.count})" if 0 < len(values) < row.count else ""
+    return over_seeds(values, digits) + few
 
 
 def _records(rows: Sequence[Runs], paper: Printed) -> list[dict[str, Any]]:
