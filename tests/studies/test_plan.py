@@ -59,6 +59,7 @@ def test_what_there_is_not_is_refused(tmp_path):
         ({"scenes": ["glass"]}, "leaderboard.scenes: there is no glass; there are cooling"),
         ({"tracks": ["laps"]}, "leaderboard.tracks: there is no laps"),
         ({"root": None}, "leaderboard.root=FOLDER"),
+        ({"clock": "seconds"}, "leaderboard.clock must be one of train_seconds, cpu_seconds, got 'seconds'"),
         ({"seeds": ["a"]}, "leaderboard.seeds must be a whole number, 0 or more, got a"),
     ):
         with pytest.raises(SceneError, match=message):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_option
 from heatsplat.io.command_lines import setting
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.metrics.definitions import DEFINITIONS
@@ -21,6 +21,7 @@ DECIDED = {
     "data.scene": "scenes",
     "seed": "seeds",
 }  # key of a run -> what chooses among its values
+CLOCKS = ("train_seconds", "cpu_seconds")
 
 
 @dataclass(frozen=True)
@@ -200,6 +201,7 @@ def board_of(
                 f"leaderboard.{key}: there is no {', '.join(unknown)}; there are {', '.join(choices[key])}"
             )
 
+    check_option("leaderboard.clock", asked["clock"], CLOCKS, SceneError)
     seeds = whole_numbers("leaderboard.seeds", listed(asked["seeds"]) or protocol["seeds"], least=0)
 
     def path(text: str | None) -> Path | None:
