@@ -59,6 +59,14 @@ def test_what_there_is_not_is_refused(tmp_path):
         ({"scenes": ["glass"]}, "leaderboard.scenes: there is no glass; there are cooling"),
         ({"tracks": ["laps"]}, "leaderboard.tracks: there is no laps"),
         ({"root": None}, "leaderboard.root=FOLDER"),
+        (
+            {"protocol": ASKED["protocol"] | {"scores": ["mae"]}},
+            "each of scores of the protocol must be one of mae_c, psnr, .*'mae'",
+        ),
+        (
+            {"protocol": ASKED["protocol"] | {"reference": "3dg"}},
+            "the protocol's reference must be one of 3dgs, etgs, .* '3dg'",
+        ),
         ({"clock": "seconds"}, "leaderboard.clock must be one of train_seconds, cpu_seconds, got 'seconds'"),
         ({"seeds": ["a"]}, "leaderboard.seeds must be a whole number, 0 or more, got a"),
     ):

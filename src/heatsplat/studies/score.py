@@ -21,12 +21,21 @@ from heatsplat.io.tables import markdown_table, number, write_csv
 from heatsplat.io.tiff import read_temperature
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.metrics.scores import Scorer, mean_of_images
+from heatsplat.studies.options import subset_of
 
 log = logging.getLogger("heatsplat")
 
 META, SCENES, TRUTH = "meta.json", "scenes", "truth"
 ENDINGS = (".tiff", ".tif", ".npy")
 COSTS = ("seconds", "memory_mb", "gaussians")  # of a scene, in a submission's metrics.json
+OF_RENDERS = (
+    "mae_c",
+    "psnr",
+    "ssim",
+    "mae_inlier_c",
+    "mae_roi_c",
+    "mae_roi_inlier_c",
+)  # scores that renders alone tell
 ABSOLUTE_ZERO_C = -273.15
 MANY = 0.2  # share of a scene's pixels outside of the camera's bounds from which on they may be no °C
 
@@ -199,6 +208,11 @@ def score_submission(folder: Path, root: Path, scores: Sequence[str]) -> tuple[d
     return told, found
 
 
+def scores_of(protocol: Mapping[str, Any]) -> list[str]:
+    """The scores of a protocol, the one that ranks first. Raises SceneError for none, and for one that renders do not tell."""
+    return subset_of("scores of the protocol", protocol["scores"], OF_RENDERS)
+
+
 def scenes_in(root: Path) -> list[str]:
     """Names of the scenes of a protocol's folder that have a truth. Raises SceneError where there are none."""
     names = sorted(
@@ -229,7 +243,7 @@ def run(
         raise SceneError(
             "give the folder of renders and that of the protocol's scenes: submission=FOLDER root=FOLDER (docs/protocol.md)"
         )
-    output_dir, scores = Path(output_dir), list(protocol["scores"])
+    output_dir, scores = Path(output_dir), scores_of(protocol)
     folder, root = Path(submission).expanduser(), Path(root).expanduser()
     if (track := read_submission(folder).get("track")) not in (None, *protocol["tracks"]):
         raise SceneError(

@@ -14,7 +14,7 @@ from heatsplat.io.results import METRICS_FILE
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.leaderboard.earlier import EarlierPage, read_page
 from heatsplat.studies.options import listed, whole_numbers
-from heatsplat.studies.score import META, SCENES, SceneScore, scenes_in, score_submission
+from heatsplat.studies.score import META, SCENES, SceneScore, scenes_in, score_submission, scores_of
 
 DECIDED = {
     "method": "methods",
@@ -201,6 +201,7 @@ def board_of(
                 f"leaderboard.{key}: there is no {', '.join(unknown)}; there are {', '.join(choices[key])}"
             )
 
+    scores_of(protocol)
     check_option("leaderboard.clock", asked["clock"], CLOCKS, SceneError)
     seeds = whole_numbers("leaderboard.seeds", listed(asked["seeds"]) or protocol["seeds"], least=0)
 
@@ -215,7 +216,10 @@ def board_of(
     submissions = [_submission(folder, board, known) for folder in folders.values()]
     _check_seeds(submissions)
     earlier = path(asked["earlier"])
-    return replace(board, submissions=submissions, earlier=None if earlier is None else read_page(earlier, board))
+    page = None if earlier is None else read_page(earlier, board)
+    names = [*known, *(one.method for one in submissions), *(method for method, _, _ in (page.seeds if page else ()))]
+    check_option("the protocol's reference", protocol["reference"], dict.fromkeys(names), SceneError)
+    return replace(board, submissions=submissions, earlier=page)
 
 
 def _submission(folder: Path, board: Board, known: Collection[str]) -> Submission:
