@@ -143,8 +143,8 @@ def test_results_of_other_settings_are_not_a_jobs_own(tmp_path):
     assert launched(tmp_path, *jobs) == ([1, 2, 3, 4], [done, *[failed] * 4])
 
 
-def test_a_job_that_dies_before_it_wrote_anything_is_in_the_table(tmp_path, monkeypatch, caplog):
-    """As one that is taken out of a queue before it starts, or whose node cannot load what it needs."""
+def composing(folder: Path, scene: str = "cooling"):
+    """A launcher of a sweep in ``folder`` whose configuration is a small file there, and whose jobs all die."""
     from hydra._internal.config_loader_impl import ConfigLoaderImpl
     from hydra._internal.utils import create_config_search_path
 
@@ -154,16 +154,36 @@ def test_a_job_that_dies_before_it_wrote_anything_is_in_the_table(tmp_path, monk
         def outcomes(self, jobs):
             return iter([RuntimeError("out of memory")] * len(jobs))
 
-    (tmp_path / "train.yaml").write_text("method: 3dgs\nseed: 0\ndata: {scene: cooling}\n")
-    loader = ConfigLoaderImpl(create_config_search_path(str(tmp_path)))
-    settings = [f"hydra.sweep.dir={tmp_path}/sweep", "hydra.sweep.subdir=${hydra:job.num}", "hydra/hydra_logging=none"]
-    caplog.set_level("INFO", "heatsplat")
+    (folder / "train.yaml").write_text(f"method: 3dgs\nseed: 0\nthreads: 1\ndata: {{scene: {scene}}}\n")
+    loader = ConfigLoaderImpl(create_config_search_path(str(folder)))
+    settings = [f"hydra.sweep.dir={folder}/sweep", "hydra.sweep.subdir=${hydra:job.num}", "hydra/hydra_logging=none"]
     launcher = Launcher()
     launcher.hydra_context = type("Context", (), {"config_loader": loader})
     launcher.config = loader.load_configuration("train", settings, RunMode.MULTIRUN)
-    launcher.launch([["method=3dgs", "seed=0"], ["method=3dgs", "seed=1"]], 0)
+    return launcher
+
+
+def test_results_of_a_file_that_was_edited_since_are_not_a_jobs_own(tmp_path):
+    """The job is run, and compares what was composed, as with launcher=basic."""
+    jobs, done, failed = [["seed=0"], ["seed=1", "threads=2"]], JobStatus.COMPLETED, JobStatus.FAILED
+    composing(tmp_path).launch(jobs, 0)
+    for number in range(2):
+        RunResults().write(tmp_path / "sweep" / str(number) / "metrics.json")
+    statuses = [[job.status for job in composing(tmp_path, scene).launch(jobs, 0)] for scene in ("cooling", "heated")]
+    assert statuses == [[done, done], [failed, failed]]
+    (tmp_path / "sweep" / "0" / ".hydra" / "config.yaml").write_text("{")
+    assert [job.status for job in composing(tmp_path).launch(jobs, 0)] == [failed, done]
+
+
+def test_a_job_that_dies_before_it_wrote_anything_is_in_the_table(tmp_path, monkeypatch, caplog):
+    """As one that is taken out of a queue before it starts, or whose node cannot load what it needs."""
+    from hydra_plugins.heatsplat_launchers import _jobs
+
+    caplog.set_level("INFO", "heatsplat")
+    jobs = ["method=3dgs", "seed=0"], ["method=3dgs", "seed=1"]
+    composing(tmp_path).launch(jobs, 0)
     monkeypatch.setattr(_jobs, "MANY", 2)
-    launcher.launch([["method=3dgs", "seed=0"], ["method=3dgs", "seed=1"]], 0)  # the same once more
+    composing(tmp_path).launch(jobs, 0)  # the same once more
     assert caplog.text.count("composing the settings of 2 jobs") == 1
     (row,) = collect(tmp_path / "sweep")
     assert (row.scene, row.label, row.failed) == ("cooling", "3dgs", ["RuntimeError: out of memory"] * 2)

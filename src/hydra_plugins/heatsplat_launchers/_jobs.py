@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from heatsplat.io.command_lines import as_dict
 from heatsplat.io.files import write_atomically
-from heatsplat.io.recorded import CONFIG, OVERRIDES, overrides_of
+from heatsplat.io.recorded import CONFIG, OVERRIDES, config_of, overrides_of
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 
 log = logging.getLogger("heatsplat")
@@ -44,12 +44,14 @@ class Job:
         overrides: what it sets.
         folder: where its results go.
         threads: CPU threads that it uses; None for all cores.
+        anew: whether results in its folder are of files of configuration that say other things now.
     """
 
     number: int
     overrides: tuple[str, ...]
     folder: Path
     threads: int | None
+    anew: bool = False
 
 
 class JobLauncher(Launcher):
@@ -110,7 +112,22 @@ def planned(context: HydraContext, config: DictConfig, number: int, overrides: S
     """A job of a sweep with its folder, which Hydra names by the job's own configuration."""
     with composed(context, config, number, overrides) as own:
         folder = Path(own.hydra.sweep.dir, own.hydra.sweep.subdir)
-        return Job(number, tuple(overrides), folder, OmegaConf.select(own, "threads"))
+        return Job(number, tuple(overrides), folder, OmegaConf.select(own, "threads"), _differs(own, folder))
+
+
+def _differs(config: DictConfig, folder: Path) -> bool:
+    """Whether a folder has results of other settings than are composed, which the command line need not tell: files may have
+    been edited since."""
+    if not (folder / METRICS_FILE).exists():
+        return False
+    from heatsplat.runs.resume import differences
+
+    try:
+        before = config_of(folder)
+    except (ValueError, OSError):  # the job says so itself
+        return True
+    own = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    return bool(before and differences(OmegaConf.to_container(own, resolve=False), before))
 
 
 @contextmanager
@@ -192,7 +209,7 @@ def _finished(job: Job) -> JobReturn | None:
         before = overrides_of(job.folder)
     except (ValueError, OSError):  # the job says so itself, and takes no other down
         return None
-    if learned_by(before) != learned_by(as_dict(job.overrides)):
+    if job.anew or learned_by(before) != learned_by(as_dict(job.overrides)):
         return None  # the job compares what was composed, and refuses the results of other settings
     log.info("#%d has results already; skipped. Delete %s to run it again.", job.number, job.folder)
     done = JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED)
