@@ -175,8 +175,8 @@ def _check_own(config: dict[str, Any], output_dir: Path, path: Path, checkpoint:
             )
         raise OccupiedError(
             f"{output_dir} holds an unfinished run with other settings ({shortened(changed)}), of which "
-            f"{path.name} is of step {step}: give another folder with hydra.run.dir; or go on with that "
-            f"run, with its settings and {ckpt}; or delete that folder"
+            f"{path.name} is of step {step}: give another folder with hydra.run.dir (of a sweep: hydra.sweep.dir); or go on "
+            f"with that run, with its settings and {ckpt}; or delete that folder"
         )
 
 
