@@ -9,6 +9,8 @@ from hydra.core.hydra_config import HydraConfig
 from running import compose_run
 
 from heatsplat.contracts import SceneError
+from heatsplat.io.command_lines import as_dict
+from heatsplat.studies.finished import named_row
 from heatsplat.studies.published.figures import figures, quoted
 from heatsplat.studies.rows import Rows
 
@@ -30,6 +32,8 @@ def test_every_row_meets_every_combination_of_the_grid_and_a_grid_needs_no_rows(
     assert first == 0 and Rows().jobs(grid, nowhere) == (grid, 0)
     loose = Rows({"a": None, 8: {"set": None}, "c": {"set": "max_steps=5"}})  # as people write them
     assert loose.jobs([[]], nowhere)[0] == [["row='a'"], ["row='8'"], ["max_steps=5", "row='c'"]]
+    ((told,),), _ = Rows({"what's new": {}}).jobs([[]], nowhere)
+    assert compose_run("method=3dgs", told)["row"] == "what's new" == named_row(as_dict([told]))
 
 
 @pytest.mark.parametrize(

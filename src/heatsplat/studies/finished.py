@@ -276,7 +276,7 @@ def unshared(names: Sequence[Hashable], settings: Sequence[Sequence[str]]) -> li
 
 def named_row(overrides: Mapping[str, str]) -> str:
     """Name of the row that a job was given (``row=``), empty for none."""
-    name = overrides.get("row", "").strip("'\"")
+    name = overrides.get("row", "").strip("'\"").replace("\\'", "'")
     return "" if name == "null" else name
 
 

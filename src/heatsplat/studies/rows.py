@@ -50,9 +50,8 @@ class Rows(SweepPlan):
         if not self.rows:
             return list(grid), 0
         self._check_methods(grid)
-        return [
-            [*job, *listed((row or {}).get("set")), f"row='{name}'"] for job in grid for name, row in self.rows.items()
-        ], 0
+        named = {str(name).replace("'", "\\'"): listed((row or {}).get("set")) for name, row in self.rows.items()}
+        return [[*job, *own, f"row='{name}'"] for job in grid for name, own in named.items()], 0
 
     def _check_methods(self, grid: Sequence[Overrides]) -> None:
         """Raises SceneError where the rows would not be what they are called, for they are parts of another method."""
