@@ -15,6 +15,7 @@ from running import compose_run
 from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
+from heatsplat.studies.frontier import report
 from heatsplat.studies.frontier import study as frontier
 from heatsplat.studies.frontier.report import markdown
 from heatsplat.studies.frontier.runs import dominated, find_runs, group, seconds_to
@@ -145,6 +146,14 @@ def test_images_that_only_training_sees_smaller_are_compared(tmp_path):
     made(tmp_path / "a", "supirgs", [], [], 1.0, 30.0, **measured("160x128", 9, "40x32"))
     made(tmp_path / "b", "bicubic_3dgs", [], [], 2.0, 25.0, **measured("160x128", 9))
     assert names_by_panel(tmp_path) == {"cooling": {"supirgs", "bicubic_3dgs"}}
+
+
+def test_the_picture_has_no_more_scenes_than_can_be_shown(tmp_path, monkeypatch):
+    for k, scene in enumerate(("64x52", "160x128", "80x64")):
+        made(tmp_path / str(k), "etgs", [], [], 1.0, 30.0, **measured(scene, 9))
+    monkeypatch.setattr(report, "DRAWN", 2)
+    figure = report.picture(group(find_runs([tmp_path])))
+    assert len(figure.axes) == 4 and figure.get_suptitle() == "the first 2 of 3 scenes; the tables have all"
 
 
 def test_titles_say_as_much_as_tells_panels_apart(tmp_path):

@@ -15,6 +15,7 @@ from heatsplat.metrics.definitions import DEFINITIONS, described
 from heatsplat.studies.child_runs import all_rows
 from heatsplat.studies.finished import NAMES, SEEDS, clocks, ran_on
 from heatsplat.studies.frontier.runs import SCORES, Recipe, dominated
+from heatsplat.studies.sweeps import DRAWN
 
 COLUMNS = ("train_seconds", "psnr", "ssim", "mae_c", "peak_memory_mb", "render_fps", "gaussians")
 LEGEND = (
@@ -122,9 +123,12 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
 
     A recipe looks the same in all panels.
     """
-    scenes = list(dict.fromkeys(recipe.scene for recipe in recipes))
+    every = list(dict.fromkeys(recipe.scene for recipe in recipes))
+    scenes = every[:DRAWN]
     places = {name: j for j, name in enumerate(sorted({recipe.name for recipe in recipes}))}
     figure = Figure(figsize=(11, 4.4 * len(scenes)), dpi=110, layout="constrained")
+    if len(scenes) < len(every):
+        figure.suptitle(f"the first {len(scenes)} of {len(every)} scenes; the tables have all")
     for i, scene in enumerate(scenes):
         own = [recipe for recipe in recipes if recipe.scene == scene]
         for k, name in enumerate(SCORES):
