@@ -43,6 +43,7 @@ def test_the_table_has_ranks_reasons_and_costs(tmp_path):
     rows = list(csv.DictReader((sweep / "leaderboard.csv").open()))
     found = [row["mae_c_times"] for row in rows if (row["method"], row["scene"]) == ("3dgs", "cooling")]
     assert [round(float(text), 3) for text in found] == [1.0, 1.2]
+    assert [row["seed"] for row in rows if row["method"] == "etgs" and row["scene"] == "cooling"] == ["0", "1"]
     assert {row["method"] for row in rows if row["reason"]} == {"3dgs", "etgs", "supirgs"} and len(rows) == 8
 
 

@@ -183,7 +183,8 @@ def _records(entries: Sequence[Entry], board: Board) -> list[Mapping[str, object
             score = run.score
             values = {name: score.mean(name) for name in board.scores}
             by_part = {f"{name}_{part}": score.mean(name, part) for part in score.parts for name in board.scores}
-            rows.append({**about, **values, **by_part, **run.cost, "folder": os.path.basename(run.folder)})
+            where = {"seed": run.seed, "folder": os.path.basename(run.folder)}
+            rows.append({**about, **values, **by_part, **run.cost, **where})
         if entry.lost or not entry.seeds:
             rows.append({**about, "reason": entry.lost or entry.reason})
     return rows
