@@ -28,14 +28,8 @@ log = logging.getLogger("heatsplat")
 META, SCENES, TRUTH = "meta.json", "scenes", "truth"
 ENDINGS = (".tiff", ".tif", ".npy")
 COSTS = ("seconds", "memory_mb", "gaussians")  # of a scene, in a submission's metrics.json
-OF_RENDERS = (
-    "mae_c",
-    "psnr",
-    "ssim",
-    "mae_inlier_c",
-    "mae_roi_c",
-    "mae_roi_inlier_c",
-)  # scores that renders alone tell
+# Scores that renders alone tell.
+OF_RENDERS = ("mae_c", "psnr", "ssim", "mae_inlier_c", "mae_roi_c", "mae_roi_inlier_c")
 ABSOLUTE_ZERO_C = -273.15
 MANY = 0.2  # share of a scene's pixels outside of the camera's bounds from which on they may be no °C
 

@@ -241,7 +241,7 @@ def _result(folder: Path, seed: int, told: Sequence[str], entry: Entry, board: B
         raise SceneError(re.sub(r"^[\w.]+Error: ", "", reason_of(folder)))
     if lacking := [text for text in board.protocol["tracks"][entry.track] if text not in told]:
         raise SceneError(
-            f"{folder} was trained without {' '.join(lacking)} of the track {entry.track}; give another hydra.sweep.dir, or "
+            f"{folder.name} was trained without {' '.join(lacking)} of the track {entry.track}; give another hydra.sweep.dir, or "
             "delete the folder to run it again"
         )
     try:
