@@ -80,8 +80,8 @@ def run(
     margins = {"psnr": psnr_margin_db, "mae_c": mae_margin_c}
     for key, margin in zip(("study.psnr_margin_db", "study.mae_margin_c"), margins.values(), strict=True):
         check_numbers(key, margin, error=SceneError)
-    if "max_steps" not in as_dict(reference):
-        raise SceneError(f"study.reference={reference}: give its length too, such as max_steps=30000")
+    if not as_dict(reference).get("max_steps", "").isdecimal():
+        raise SceneError(f"study.reference={reference}: give its length too, a whole number, such as max_steps=30000")
     if runs is None:
         runs = [] if cases else outputs
     folders = [Path(text).expanduser() for text in listed(runs)]
