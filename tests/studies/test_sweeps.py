@@ -274,6 +274,24 @@ def test_a_row_of_several_methods_is_a_row_for_each(tmp_path):
     assert {row.label: row.mean("psnr") for row in collect(tmp_path)} == {"plain, etgs": 30.0, "plain, 3dgs": 31.0}
 
 
+def test_jobs_of_which_nothing_can_be_read_are_told_one_by_one(sweep):
+    for number in (1, 3):
+        (path,) = sweep.glob(f"*_{number}_x")
+        (path / ".hydra" / "overrides.yaml").write_text("{")
+    table = markdown(collect(sweep), {})
+    assert table.count("overrides.yaml cannot be read") == 2 and "Jobs without a result: 4" in table
+
+
+def test_scores_that_have_the_name_of_a_column_take_no_other_down(sweep):
+    (path,) = sweep.glob(f"*_0_x/{METRICS_FILE}")
+    results = RunResults.read(path)
+    for name in ("failed", "results", "name"):
+        results.put("test", name, 1.0)
+    results.write(path)
+    assert next(row for row in collect(sweep) if row.name == "K = 8").count == 2
+    assert "| row | runs | PSNR (dB) | MAE (°C) | train (s) |" in markdown(collect(sweep), {})
+
+
 def test_results_that_cannot_be_read_are_told_beside_the_others(sweep):
     damaged = next(path for path in sweep.iterdir() if "_1_" in path.name)
     (damaged / METRICS_FILE).write_text("{")

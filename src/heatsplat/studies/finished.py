@@ -19,6 +19,22 @@ from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 
 log = logging.getLogger(__name__)
 
+# Columns of a table of runs that are no score; a score of this name, of a callback that is not ours, has none.
+COLUMNS = {
+    "folder",
+    "scene",
+    "method",
+    "row",
+    "overrides",
+    "failed",
+    "results",
+    "data",
+    "name",
+    "other",
+    "title",
+    "measured",
+    "course",
+}
 # Overrides that make no other recipe. runs.resume.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of
 # folders, are among them; the method is named by itself.
 SEEDS = {"seed", "data.seed", "data.scene_seed"}
@@ -138,7 +154,9 @@ def _read(folder: Path) -> dict[str, Any]:
         "row": named_row(overrides), "overrides": overrides, "failed": failed, "results": results,
         "data": _data(config),
     }  # fmt: skip
-    return found if results is None else found | results.test | results.cost
+    if results is None:
+        return found
+    return found | {name: value for name, value in (results.test | results.cost).items() if name not in COLUMNS}
 
 
 def _scene(config: Mapping[str, Any]) -> str:
@@ -170,7 +188,12 @@ def each_seed_once(runs: pd.DataFrame, rows: Sequence[Hashable]) -> pd.DataFrame
         runs: of ``read_runs``.
         rows: of each the row that it is of, with its scene.
     """
-    seeds = [seeds_of(run.overrides, run.results) for run in runs.itertuples()]
+    seeds = [
+        seeds_of(run.overrides, run.results)
+        if run.overrides or run.results
+        else run.folder  # of which nothing is known
+        for run in runs.itertuples()
+    ]
     told = runs.assign(which=[*zip(rows, seeds, strict=True)], done=runs["failed"].isna())
     kept = told.sort_values("done", kind="stable").drop_duplicates("which", keep="last").index
     if twice := runs.loc[~runs.index.isin(kept), "folder"].tolist():

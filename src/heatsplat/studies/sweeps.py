@@ -15,7 +15,17 @@ from heatsplat.io.recorded import OVERRIDES
 from heatsplat.io.tables import NONE, markdown_table, over_seeds, write_csv
 from heatsplat.metrics.definitions import described, unit_of
 from heatsplat.studies.child_runs import all_rows
-from heatsplat.studies.finished import Runs, clocks, each_seed_once, ran_on, read_runs, row_names, settings_of, versions
+from heatsplat.studies.finished import (
+    COLUMNS,
+    Runs,
+    clocks,
+    each_seed_once,
+    ran_on,
+    read_runs,
+    row_names,
+    settings_of,
+    versions,
+)
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
 # Scores and costs in the table, where any job has them; between them stand the scores of own callbacks.
@@ -80,7 +90,7 @@ def _columns(rows: Sequence[Runs]) -> list[str]:
         for row in rows
         for found in row.table["results"].dropna()
         for name in found.test
-        if described(name) is None
+        if described(name) is None and name not in COLUMNS
     )
     return [name for name in (*SCORES, *own, *COSTS) if any(row.values(name) for row in rows)]
 

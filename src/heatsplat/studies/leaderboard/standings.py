@@ -226,8 +226,10 @@ def _add_run(places: Mapping[Place, Entry], folder: Path, board: Board) -> None:
     scene = overrides.get("data.scene", "").strip("'")  # in quotes where Hydra would not take its name as it stands
     key = (overrides.get("method", ""), scene, overrides.get("leaderboard.track", ""))
     entry = places.get(key)
+    if entry is None:
+        return
     seed = int(overrides.get("seed", 0))
-    if entry is None or seed not in board.seeds or seed in entry.all_numbers:
+    if seed not in board.seeds or seed in entry.all_numbers:
         return
     try:
         entry.runs.append(_result(folder, seed, told, entry, board))
