@@ -35,3 +35,14 @@ def test_the_first_line_of_the_job_is_followed_by_settings_and_every_choice_is_t
 
 def test_every_format_of_an_export_is_explained():
     assert re.findall(r"^what:  # with what=(\w+)", usage("export", DOC), re.MULTILINE) == options_of("what")
+
+
+def test_a_study_that_is_named_has_its_settings_explained():
+    text = usage("study", DOC, ["study=time_to_accuracy", "threads=1"])
+    (told,) = re.findall(r"^study:  # with study=time_to_accuracy\n((?:  .*\n)+)", text, re.MULTILINE)
+    assert (
+        "  clock: train_seconds    # train_seconds (on a machine" in told
+        and "  threads: ${threads}     # of each" in told
+    )
+    assert "\n    - callbacks.probes=null\n" in told and "_target_" not in told
+    assert "study=NAME --help explains" in text and "# with study=" not in usage("study", DOC)

@@ -29,13 +29,15 @@ def usage(command: str, doc: str, arguments: Sequence[str] = ()) -> str:
     Args:
         command: such as "train", the name of its file in the folder of configurations.
         doc: of its job, whose first line comes first.
-        arguments: of the command line, of which --config-dir is a further folder of configurations.
+        arguments: of the command line, of which --config-dir is a further folder of configurations, and study=NAME the study
+            whose settings are asked for.
     """
     places = [Path(CONF), *_given(arguments)]
     text = (places[0] / f"{command}.yaml").read_text(encoding="utf-8")
     own, *_ = re.split(r"^(?:hydra:|\w+: +# internal)", text, maxsplit=1, flags=re.MULTILINE)
     lines = [doc.partition("\n")[0], "", *_explained(own)]
-    for group, pattern in EXPLAINED.get(command, {}).items():
+    asked = {group: option for group, _, option in (text.partition("=") for text in arguments) if group == command}
+    for group, pattern in (EXPLAINED.get(command, {}) | asked).items():  # of a study that is named, its own
         for option, file in _options(places, group, pattern).items():
             inner = _explained(file.read_text(encoding="utf-8"))
             lines += ["", f"{group}:  # with {group}={option}", *(f"  {line}" for line in inner)]
@@ -43,7 +45,8 @@ def usage(command: str, doc: str, arguments: Sequence[str] = ()) -> str:
         options = _options(places, group)
         wide = max(map(len, options))
         told = (f"  {option:{wide}}  {_sentence(file)}".rstrip() for option, file in options.items())
-        lines += ["", f"{group}:", *told]
+        hint = f"  # {group}=NAME --help explains the settings of one" if group == command else ""
+        lines += ["", f"{group}:{hint}", *told]
     groups = re.findall(r"^  - (\w+):", own, re.MULTILINE) if command in TOLD else []
     choices = {group: _options(places, group) for group in groups if group not in ELSEWHERE}
     if any(choices.values()):
@@ -74,9 +77,9 @@ def _options(places: Sequence[Path], group: str, pattern: str = "*") -> dict[str
 
 def _explained(text: str) -> list[str]:
     """The lines of a file of configuration that say something to a user: choices of groups stand as they are set."""
-    internal = ("defaults:", "_target_", "by:", "- _self_", "- override", "- optional")
+    internal = ("defaults:", "_target_", "by:", "- _self_", "- override", "- optional", "- /", "# @package")
     lines = (line for line in text.strip().splitlines() if not line.strip().startswith(internal))
-    return [line.removeprefix("  - ") for line in lines if ": ${" not in line or "#" in line]
+    return [re.sub(r"^  - (?=\w+: )", "", line) for line in lines if ": ${" not in line or "#" in line]
 
 
 def _sentence(file: Path) -> str:

@@ -15,8 +15,9 @@ def test_several_seeds_have_a_spread_and_one_has_none():
     assert over_seeds([1.0], 2) == "1.00" and over_seeds([], 2) == NONE
 
 
-def test_bars_in_cells_are_escaped():
+def test_bars_and_ends_of_lines_in_cells_are_escaped():
     assert markdown_table(["a", "b"], [["x|y", 1]], "lr") == ["| a | b |", "|---|---:|", r"| x\|y | 1 |"]
+    assert markdown_table(["a"], [["two\nlines"]])[2] == "| two lines |"
 
 
 def test_a_file_holds_numbers_texts_and_nothing(tmp_path):

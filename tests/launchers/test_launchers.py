@@ -21,6 +21,7 @@ from running import run
 from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import RunResults
+from heatsplat.studies.sweeps import collect
 from heatsplat.training.machine import cores
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -104,6 +105,9 @@ def launched(folder: Path, *jobs: list[str]) -> tuple[list[int], list[JobStatus]
         def _job(self, number, overrides):
             return Job(number, tuple(overrides), folder / str(number), None)
 
+        def write_down(self, job):
+            pass
+
     launcher = Launcher()
     launcher.config = OmegaConf.create(
         {"hydra": {"hydra_logging": None, "verbose": False, "sweep": {"dir": str(folder)}}}
@@ -124,7 +128,7 @@ def test_damaged_results_of_one_job_do_not_keep_the_others_from_running(tmp_path
 def test_results_of_other_settings_are_not_a_jobs_own(tmp_path):
     """The job is run, and refuses its folder by itself; where and how it runs is no other setting."""
     before = ["max_steps=40", "seed=0", "row=a", "threads=1", "callbacks.images=null"]
-    for number in range(3):
+    for number in range(5):
         (tmp_path / str(number) / ".hydra").mkdir(parents=True)
         (tmp_path / str(number) / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(before))
         RunResults().write(tmp_path / str(number) / "metrics.json")
@@ -132,9 +136,57 @@ def test_results_of_other_settings_are_not_a_jobs_own(tmp_path):
         ["seed=0", "max_steps=40", "row=b", "threads=2", "launcher=joblib"],
         ["seed=0", "max_steps=80", "row=a"],
         ["seed=0", "max_steps=40", "+thermal.clip=null"],
+        ["seed=0", "max_steps=40", "callbacks=plateau"],
+        ["seed=0", "max_steps=40", "+trainer.gradient_clip_val=1e-4", "trainer.val_check_interval=9"],
     )
     done, failed = JobStatus.COMPLETED, JobStatus.FAILED
-    assert launched(tmp_path, *jobs) == ([1, 2], [done, failed, failed])
+    assert launched(tmp_path, *jobs) == ([1, 2, 3, 4], [done, *[failed] * 4])
+
+
+def composing(folder: Path, scene: str = "cooling"):
+    """A launcher of a sweep in ``folder`` whose configuration is a small file there, and whose jobs all die."""
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+    from hydra._internal.utils import create_config_search_path
+
+    from hydra_plugins.heatsplat_launchers import _jobs
+
+    class Launcher(_jobs.JobLauncher):
+        def outcomes(self, jobs):
+            return iter([RuntimeError("out of memory")] * len(jobs))
+
+    (folder / "train.yaml").write_text(f"method: 3dgs\nseed: 0\nthreads: 1\ndata: {{scene: {scene}}}\n")
+    loader = ConfigLoaderImpl(create_config_search_path(str(folder)))
+    settings = [f"hydra.sweep.dir={folder}/sweep", "hydra.sweep.subdir=${hydra:job.num}", "hydra/hydra_logging=none"]
+    launcher = Launcher()
+    launcher.hydra_context = type("Context", (), {"config_loader": loader})
+    launcher.config = loader.load_configuration("train", settings, RunMode.MULTIRUN)
+    return launcher
+
+
+def test_results_of_a_file_that_was_edited_since_are_not_a_jobs_own(tmp_path):
+    """The job is run, and compares what was composed, as with launcher=basic."""
+    jobs, done, failed = [["seed=0"], ["seed=1", "threads=2"]], JobStatus.COMPLETED, JobStatus.FAILED
+    composing(tmp_path).launch(jobs, 0)
+    for number in range(2):
+        RunResults().write(tmp_path / "sweep" / str(number) / "metrics.json")
+    statuses = [[job.status for job in composing(tmp_path, scene).launch(jobs, 0)] for scene in ("cooling", "heated")]
+    assert statuses == [[done, done], [failed, failed]]
+    (tmp_path / "sweep" / "0" / ".hydra" / "config.yaml").write_text("{")
+    assert [job.status for job in composing(tmp_path).launch(jobs, 0)] == [failed, done]
+
+
+def test_a_job_that_dies_before_it_wrote_anything_is_in_the_table(tmp_path, monkeypatch, caplog):
+    """As one that is taken out of a queue before it starts, or whose node cannot load what it needs."""
+    from hydra_plugins.heatsplat_launchers import _jobs
+
+    caplog.set_level("INFO", "heatsplat")
+    jobs = ["method=3dgs", "seed=0"], ["method=3dgs", "seed=1"]
+    composing(tmp_path).launch(jobs, 0)
+    monkeypatch.setattr(_jobs, "MANY", 2)
+    composing(tmp_path).launch(jobs, 0)  # the same once more
+    assert caplog.text.count("composing the settings of 2 jobs") == 1
+    (row,) = collect(tmp_path / "sweep")
+    assert (row.scene, row.label, row.failed) == ("cooling", "3dgs", ["RuntimeError: out of memory"] * 2)
 
 
 @pytest.mark.parametrize("launcher", ["joblib.Joblib", "ray.Ray"])

@@ -49,7 +49,10 @@ def test_a_run_goes_on_from_the_newest_checkpoint_that_can_be_read_and_is_not_th
 
 def test_a_stopped_run_is_not_overwritten_by_one_of_other_settings(tmp_path):
     stored(tmp_path, "last.ckpt", 4, configured("optim.means=1e-3"))
-    told = r"unfinished run with other settings \(optim.means\), of which last.ckpt is of step 4: .*run.dir.*ckpt=.*/last.ckpt"
+    told = (
+        r"unfinished run with other settings \(optim.means\), of which last.ckpt is of step 4: .*run.dir \(of a sweep: "
+        r"hydra.sweep.dir\).*ckpt=.*/last.ckpt"
+    )
     for ckpt in (None, str(tmp_path / "elsewhere" / "checkpoints" / "last.ckpt")):
         with pytest.raises(OccupiedError, match=told):
             resumed(configured() | {"ckpt": ckpt}, tmp_path)

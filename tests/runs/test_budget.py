@@ -102,6 +102,7 @@ def test_points_survive_their_file_and_a_bad_one_is_named(tmp_path):
         "{header}",
         "{header}etgs,heated,0,inf,1,20,1,1,1\n",
         "{header}etgs,heated,9,inf,1,20,1,1,0\n",
+        "{header}" + 2 * "etgs,heated,9,inf,1,20,1,1,1\n",  # between which nothing is straight
         b"\0\xff".decode("latin-1"),
     ],
 )

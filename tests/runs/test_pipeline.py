@@ -20,6 +20,7 @@ from heatsplat.runs.checks import check_copied, checked
 from heatsplat.runs.folder import results_in
 from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import differences, on_scene, resumed
+from heatsplat.runs.run import begin
 from heatsplat.sensors.base import SensorChain
 from heatsplat.sensors.frame_offset import FrameOffset
 from heatsplat.training.checkpoints import load_checkpoint
@@ -416,6 +417,11 @@ def test_what_changes_nothing_that_is_learned_is_no_difference(trained):
 def test_values_out_of_range_are_refused_by_name(override, told):
     with pytest.raises(SceneError, match=told):
         checked(heatsplat.compose(["method=etgs", override]))
+
+
+def test_kernels_are_not_told_of_threads_that_are_no_number(tmp_path):
+    with pytest.raises(SceneError, match=r"threads must be 1 to .* got abc"):
+        begin(heatsplat.compose(["method=etgs", "threads=abc"]), tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from heatsplat.io.tiff import write_temperature
 from heatsplat.studies.leaderboard.plan import board_of
 
 PROTOCOL = yaml.safe_load((Path(__file__).parents[2] / "conf" / "protocol" / "thermal.yaml").read_text())
+SETTINGS = PROTOCOL["tracks"]["steps"]
 VIEWS = ("near_00003", "times_00007", "times_00008")
 ASKED = {
     "protocol": PROTOCOL, "root": None, "methods": None, "scenes": None, "tracks": ["steps"], "seeds": [0, 1],
@@ -46,7 +47,14 @@ def run_of(folder: Path, method: str, scene: str, seed: int, off: float | None, 
     """A run as the sweep leaves it; without ``off`` it failed."""
     place = folder / f"{method}_{scene}_steps_{seed}"
     (place / ".hydra").mkdir(parents=True)
-    told = [f"method={method}", f"data.scene={scene}", f"seed={seed}", "leaderboard.track=steps", f"row={method}"]
+    told = [
+        f"method={method}",
+        f"data.scene={scene}",
+        f"seed={seed}",
+        "leaderboard.track=steps",
+        f"row={method}",
+        *SETTINGS,
+    ]
     (place / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(told))
     if off is None:
         (place / "FAILED").write_text("Traceback\nheatsplat.contracts.SceneError: scene 'x' lacks weather\n")

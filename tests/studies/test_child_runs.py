@@ -15,7 +15,7 @@ from heatsplat.studies.child_runs import OtherSettingsError, all_rows, train_or_
 SCRIPT = """import json, sys
 from pathlib import Path
 from hydra.core.override_parser.overrides_parser import OverridesParser
-settings = dict(text.split("=", 1) for text in sys.argv[1:])
+settings = dict(text.partition("=")[::2] for text in sys.argv[1:])
 place = Path(OverridesParser.create().parse_override("hydra.run.dir=" + settings.pop("hydra.run.dir")).value())
 (place / ".hydra").mkdir(parents=True, exist_ok=True)
 (place / ".hydra" / "overrides.yaml").write_text(json.dumps([f"{k}={v}" for k, v in settings.items()]))
@@ -59,18 +59,29 @@ def test_a_folder_with_a_run_of_other_settings_is_refused(script, tmp_path):
         train_or_read(place, script, ["seed=3", "max_steps=5", "threads=2"], tmp_path / "study")
 
 
+def test_a_setting_that_is_given_twice_is_the_last_of_them(script, tmp_path):
+    """As a recipe's own interval of validations after that of all runs; what is taken away has no value."""
+    place, wanted = tmp_path / "one", ["max_steps=5", "~logger", "max_steps=9"]
+    for _ in range(2):
+        train_or_read(place, script, wanted, tmp_path)
+    assert (place / "times").read_text() == "once\n"
+    with pytest.raises(OtherSettingsError, match=r"\(max_steps=5, max_steps=9\)"):
+        train_or_read(place, script, wanted[:2], tmp_path)
+
+
 def test_a_report_says_what_all_of_its_runs_have():
     line = all_rows(["data.size=tiny", "threads=null"], seed=[1, 0, 1], threads=[2, 2], max_steps=[None])
     assert line == "All rows: `data.size=tiny seed=0,1 threads=2`."
     assert all_rows(["threads=1"], threads=[None]) == "All rows: `threads=1`."
 
 
-def test_a_run_that_failed_says_where_and_how_to_go_on(script, tmp_path):
-    place = tmp_path / "study" / "one"
+@pytest.mark.parametrize(("name", "typed"), [("study", "hydra.run.dir={}"), ("my study", "\"hydra.run.dir='{}'\"")])
+def test_a_run_that_failed_says_where_and_how_to_go_on(script, tmp_path, name, typed):
+    place = tmp_path / name / "one"
     with pytest.raises(SceneError, match="unlucky") as failure:
-        train_or_read(place, script, ["seed=13"], tmp_path / "study")
+        train_or_read(place, script, ["seed=13"], tmp_path / name)
     assert f"{place / 'FAILED'} says why" in str(failure.value) and sys.executable in str(failure.value)
-    assert f"hydra.run.dir={tmp_path / 'study'} goes on" in str(failure.value)
+    assert f"{typed.format(tmp_path / name)} goes on" in str(failure.value)
 
 
 def test_a_run_is_told_of_configurations_beside_ours(script, tmp_path, monkeypatch):

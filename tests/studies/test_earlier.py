@@ -95,6 +95,8 @@ def test_seeds_of_a_submission_add_up_as_those_of_runs_do(tmp_path):
     assert seeds(then, submissions=[theirs[2], theirs[2]]) == ([2], pytest.approx(3.0, abs=1e-4))  # once each
     unnumbered = [str(submission(tmp_path / f"again_{k}", off)) for k, off in enumerate((1.0, 2.0))]
     assert seeds(then, submissions=unnumbered)[0] == [0, 1]
+    assert seeds(then, submissions=[*unnumbered, theirs[0]])[0] == [0, 1, 2]  # what tells its number keeps it
+    assert seeds(then, submissions=unnumbered[:1] * 2)[0] == [0]
 
 
 def test_a_page_that_is_none_is_refused(tmp_path):

@@ -15,7 +15,9 @@ from running import compose_run
 from heatsplat import cli
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
+from heatsplat.studies.frontier import report
 from heatsplat.studies.frontier import study as frontier
+from heatsplat.studies.frontier.report import markdown
 from heatsplat.studies.frontier.runs import dominated, find_runs, group, seconds_to
 from heatsplat.studies.frontier.study import asked_for, run
 
@@ -146,6 +148,14 @@ def test_images_that_only_training_sees_smaller_are_compared(tmp_path):
     assert names_by_panel(tmp_path) == {"cooling": {"supirgs", "bicubic_3dgs"}}
 
 
+def test_the_picture_has_no_more_scenes_than_can_be_shown(tmp_path, monkeypatch):
+    for k, scene in enumerate(("64x52", "160x128", "80x64")):
+        made(tmp_path / str(k), "etgs", [], [], 1.0, 30.0, **measured(scene, 9))
+    monkeypatch.setattr(report, "DRAWN", 2)
+    figure = report.picture(group(find_runs([tmp_path])))
+    assert len(figure.axes) == 4 and figure.get_suptitle() == "the first 2 of 3 scenes; the tables have all"
+
+
 def test_titles_say_as_much_as_tells_panels_apart(tmp_path):
     made(tmp_path / "a", "etgs", [], [], 1.0, 30.0, **measured("64x52", 9))
     made(tmp_path / "b", "etgs", [], [], 1.0, 30.0, **measured("64x52", 3))
@@ -164,15 +174,9 @@ def test_titles_say_as_much_as_tells_panels_apart(tmp_path):
 
 def test_names_of_rows_stay_whole_and_say_what_else_differs(tmp_path):
     """Only settings are left out of names, whatever stands in a row's name."""
-    for i, (k, steps) in enumerate(((8, 9), (8, 9), (24, 9), (24, 18))):
-        made(
-            tmp_path / str(i),
-            "etgs",
-            [f"thermal.frequencies={k}", f"max_steps={steps}", f"row='K = {k}'"],
-            [],
-            1.0,
-            30.0,
-        )
+    for i, (k, steps, seed) in enumerate(((8, 9, 0), (8, 9, 1), (24, 9, 0), (24, 18, 0))):
+        own = [f"thermal.frequencies={k}", f"max_steps={steps}", f"row='K = {k}'", f"seed={seed}"]
+        made(tmp_path / str(i), "etgs", own, [], 1.0, 30.0)
     assert names_by_panel(tmp_path) == {
         "cooling": {"etgs, K = 8", "etgs, K = 24, max_steps=9", "etgs, K = 24, max_steps=18"}
     }
@@ -183,16 +187,34 @@ def test_names_of_rows_stay_whole_and_say_what_else_differs(tmp_path):
 def test_runs_that_went_on_and_other_seeds_of_a_scene_are_one_recipe(tmp_path):
     made(tmp_path / "a", "etgs", ["max_steps=9", "seed=0", "data.scene_seed=0"], [], 1.0, 30.0)
     made(tmp_path / "b", "etgs", ["seed=1", "data.scene_seed=1", "max_steps=9", "ckpt=runs/last.ckpt"], [], 1.0, 32.0)
-    made(
-        tmp_path / "c",
-        "etgs",
-        ["test=true", "max_steps=9", "table.scenes=[wall]", "experiment=table_etgs_1"],
-        [],
-        1.0,
-        31.0,
-    )
+    made(tmp_path / "c", "etgs", ["test=true", "max_steps=9", "table.scenes=[wall]", "seed=2"], [], 1.0, 31.0)
     (recipe,) = group(find_runs([tmp_path]))
     assert recipe.name == "etgs max_steps=9" and recipe.count == 3
+
+
+def test_a_seed_that_was_trained_twice_counts_once(tmp_path, caplog):
+    """By the same command on another day, or with its default written out: the last counts."""
+    for name, own, psnr in (("1", [], 30.0), ("2", ["seed=0", "launcher=basic"], 31.0), ("3", ["seed=1"], 33.0)):
+        made(tmp_path / name, "etgs", own, [], 1.0, psnr)
+    (recipe,) = group(find_runs([tmp_path]))
+    assert recipe.values("psnr") == [31.0, 33.0] and f"without {tmp_path / '1'}" in caplog.text
+
+
+def test_seconds_of_several_numbers_of_threads_are_told(tmp_path):
+    made(tmp_path / "a", "etgs", ["seed=0"], [], 1.0, 30.0)
+    made(tmp_path / "b", "etgs", ["seed=1"], [], 9.0, 31.0)
+    recipes = group(find_runs([tmp_path]))
+    assert "Seconds are of" not in markdown(recipes, {"psnr": [], "mae_c": []})
+    recipes[0].table["results"].iloc[0].run["threads"] = 16
+    told = "compare within one: 16 threads (1 run); 2 threads (1 run).\n"
+    assert told in markdown(recipes, {"psnr": [], "mae_c": []})
+
+
+def test_what_an_experiment_sets_is_no_seed(tmp_path):
+    """A published table trains with recipe=published, which no override of its runs tells."""
+    made(tmp_path / "a", "etgs", ["max_steps=9", "seed=0"], [], 1.0, 30.0)
+    made(tmp_path / "b", "etgs", ["max_steps=9", "seed=1", "experiment=table_etgs_1"], [], 1.0, 31.0)
+    assert names_by_panel(tmp_path) == {"cooling": {"etgs max_steps=9", "etgs max_steps=9 experiment=table_etgs_1"}}
 
 
 def test_runs_that_differ_in_more_than_their_seeds_are_recipes_of_their_own(tmp_path):
@@ -210,6 +232,12 @@ def test_a_word_or_number_is_a_list_of_one():
     ((place, overrides),) = asked_for("etgs", "heated", 0, knobs)
     assert place == "etgs_heated_dtype=float64_max_steps=9_seed=0" and overrides[1] == "data.scene=heated"
     assert asked_for({"etgs": knobs}, ["heated"], [0], None) == [(place, overrides)]
+
+
+def test_folders_of_long_knobs_have_names_that_file_systems_take():
+    asked = asked_for("supirgs", "heated", [0, 1], {"teacher": [f"/data/{'deep/' * 60}{name}.pth" for name in "ab"]})
+    places = [place for place, _ in asked]
+    assert len({*places}) == 4 and max(len(place.encode()) for place in places) <= 200
 
 
 @pytest.mark.parametrize(
@@ -241,6 +269,7 @@ def test_a_knob_that_is_null_is_null_for_its_run():
         (METRICS_FILE, "{", "is not a metrics.json of heatsplat"),
         (METRICS_FILE, '{"run": {"scene": "cooling"}}', "sections are missing or no mappings: test, cost"),
         ("curve.csv", "train_seconds,psnr\n1.0,many\n", "could not convert string to float"),
+        ("curve.csv", "train_seconds,psnr\n1,20\n2,213,22\n", "curve.csv: row 2 has more cells than columns"),
         (".hydra/overrides.yaml", "[", "while parsing"),
     ],
 )

@@ -120,6 +120,15 @@ def test_a_row_is_compared_with_the_default_of_its_own_seeds(sweep):
     assert beside_default(own[DEFAULT], rows, "nothing") is None
 
 
+def test_recordings_of_a_scene_are_compared_each_with_its_own_default(tmp_path):
+    for seed, gain in ((0, 2.0), (1, 4.0)):
+        told = ["seed=0", f"data.scene_seed={seed}"]
+        job(tmp_path, 2 * seed, [*told, f"row={DEFAULT}"], 30.0 + seed)
+        job(tmp_path, 2 * seed + 1, [*told, "n=2", "row='n 2 (x2)'"], 30.0 + seed + gain)
+    rows = collect(tmp_path)
+    assert beside_default(rows[1], rows, "psnr") == 3.0
+
+
 def test_the_table_has_the_number_that_matters_most_on_top(sweep):
     assert [path.name for path in Knobs(dict, [2]).write(sweep)] == ["table.md", "table.csv", "table.png"]
     text = (sweep / "table.md").read_text()

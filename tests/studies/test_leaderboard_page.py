@@ -49,6 +49,18 @@ def test_the_page_is_told_which_way_is_better(tmp_path):
         assert told["higher"] == higher and [one["method"] for one in told["beside"]] == ["etgs", "3dgs"]
 
 
+def test_methods_that_ran_without_the_reference_stand_in_the_table(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling", "driven"), tmp_path / "sweep"
+    run_of(sweep, "etgs", "cooling", 0, 1.0)
+    asked = board(root)
+    told = content(page(standings(sweep, asked), asked, sweep))["beside"]
+    assert [(one["method"], one["beside"], one["scenes"]) for one in told] == [("etgs", None, 0)]
+    assert told[0]["cost"]["gaussians"] == 1000
+    run_of(sweep, "3dgs", "driven", 0, 1.0)
+    told = content(page(standings(sweep, asked), asked, sweep))["beside"]
+    assert [(one["method"], one["beside"], one["scenes"]) for one in told] == [("3dgs", 1.0, 1), ("etgs", None, 0)]
+
+
 def test_pictures_are_no_wider_than_they_are_shown():
     assert f"figure img {{ display: block; width: {WIDTH}px;" in TEMPLATE.read_text(encoding="utf-8")
     halves = np.repeat([[0.0, 1.0]], 256, 0).repeat(160, 1)

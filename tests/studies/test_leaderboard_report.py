@@ -43,7 +43,31 @@ def test_the_table_has_ranks_reasons_and_costs(tmp_path):
     rows = list(csv.DictReader((sweep / "leaderboard.csv").open()))
     found = [row["mae_c_times"] for row in rows if (row["method"], row["scene"]) == ("3dgs", "cooling")]
     assert [round(float(text), 3) for text in found] == [1.0, 1.2]
+    assert [row["seed"] for row in rows if row["method"] == "etgs" and row["scene"] == "cooling"] == ["0", "1"]
     assert {row["method"] for row in rows if row["reason"]} == {"3dgs", "etgs", "supirgs"} and len(rows) == 8
+
+
+def test_seeds_that_failed_are_told_beside_those_that_did_not(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
+    for seed, off in ((0, 1.0), (1, None)):
+        run_of(sweep, "3dgs", "cooling", seed, off)
+        run_of(sweep, "etgs", "cooling", seed, 1.0)
+    write_leaderboard(sweep, board(root))
+    told = "`3dgs` on cooling, seed 1: scene 'x' lacks weather"
+    assert f"### Seeds without a result\n\n- {told}\n\n## Scores" in (sweep / "leaderboard.md").read_text()
+    rows = list(csv.DictReader((sweep / "leaderboard.csv").open()))
+    assert [row["reason"] for row in rows if row["method"] == "3dgs"] == ["", "seed 1: scene 'x' lacks weather"]
+    page = (sweep / "leaderboard.html").read_text()
+    assert page.count('"reason": "seed 1: scene \'x\' lacks weather"') == 1
+    write_leaderboard(sweep, board(root, earlier=str(earlier_page(tmp_path, root))))  # which has the seed
+    assert "Seeds without" not in (sweep / "leaderboard.md").read_text()
+
+
+def earlier_page(folder: Path, root: Path) -> Path:
+    """A page with another run of the seed."""
+    run_of(folder / "earlier", "3dgs", "cooling", 1, 1.0)
+    write_leaderboard(folder / "earlier", board(root))
+    return folder / "earlier" / "leaderboard.html"
 
 
 def test_a_sweep_without_results_replaces_no_document(tmp_path, caplog):

@@ -59,6 +59,16 @@ def test_what_there_is_not_is_refused(tmp_path):
         ({"scenes": ["glass"]}, "leaderboard.scenes: there is no glass; there are cooling"),
         ({"tracks": ["laps"]}, "leaderboard.tracks: there is no laps"),
         ({"root": None}, "leaderboard.root=FOLDER"),
+        (
+            {"protocol": ASKED["protocol"] | {"scores": ["mae"]}},
+            "each of scores of the protocol must be one of mae_c, psnr, .*'mae'",
+        ),
+        (
+            {"protocol": ASKED["protocol"] | {"reference": "3dg"}},
+            "the protocol's reference must be one of 3dgs, etgs, .* '3dg'",
+        ),
+        ({"clock": "seconds"}, "leaderboard.clock must be one of train_seconds, cpu_seconds, got 'seconds'"),
+        ({"seeds": ["a"]}, "leaderboard.seeds must be a whole number, 0 or more, got a"),
     ):
         with pytest.raises(SceneError, match=message):
             board(root, **asked)
@@ -118,6 +128,8 @@ def test_a_submission_has_a_name_of_its_own_and_a_track_of_the_board(tmp_path):
         ),  # not on this board, but perhaps on an earlier page
         ({"track": "laps"}, r'metrics.json: "track" is laps; this board has steps. Name one'),
         ({"scenes": {"cooling": 12}}, "scenes.cooling is 12"),
+        ({"method": "ours\nand theirs"}, 'metrics.json needs "method": a name'),
+        ({"method": " "}, 'metrics.json needs "method": a name'),
     ):
         folder = submission(tmp_path / "theirs", 0.1, **told)
         with pytest.raises(SceneError, match=message):
@@ -125,3 +137,14 @@ def test_a_submission_has_a_name_of_its_own_and_a_track_of_the_board(tmp_path):
     (found,) = board(root, submissions=[str(submission(tmp_path / "theirs", 0.1))]).submissions
     assert (found.method, found.track, found.command) == ("theirs", "steps", "a submission")
     assert found.scores["cooling"].mean("mae_c") == pytest.approx(0.1, abs=1e-5)
+
+
+def test_two_runs_of_other_code_are_two_seeds(tmp_path):
+    """Of two that say the same seed one would count, without a word."""
+    root = protocol_folder(tmp_path / "root", "cooling")
+    first, second = (str(submission(tmp_path / name, 0.1, seed=0)) for name in ("first", "second"))
+    with pytest.raises(SceneError, match=r"first and .*second both hand in seed 0 of theirs on cooling: .* leave one"):
+        board(root, submissions=[first, second])
+    assert len(board(root, submissions=[first, f"{second}/../first"]).submissions) == 1  # the same folder
+    submission(tmp_path / "second", 0.1, seed=1, machine="RTX 4090")
+    assert [one.machine for one in board(root, submissions=[first, second]).submissions] == ["", "RTX 4090"]

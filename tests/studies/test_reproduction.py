@@ -21,6 +21,7 @@ from heatsplat.io.results import RunResults
 from heatsplat.studies.finished import Runs
 from heatsplat.studies.published.comparison import compare, compare_all, markdown, write_comparison
 from heatsplat.studies.published.reproduction import Reproduction, Run, reproduction_of
+from heatsplat.studies.published.sources import source
 
 ROOT = Path(__file__).resolve().parents[2]
 EXPERIMENTS = sorted((ROOT / "conf" / "experiment").glob("table_*.yaml"))
@@ -124,6 +125,17 @@ def test_scenes_are_found_by_name_other_name_and_what_is_told(tmp_path):
         reproduction.runs[-1].overrides[0] == "method=etgs"
         and "data.scene='Cooling-Bench'" in reproduction.runs[-2].overrides
     )
+
+
+def test_folders_are_told_apart_in_any_script(tmp_path):
+    """Names without a Latin letter were all one, and a told name was only as good as its likeness."""
+    rhd = source("rhd")
+    for name in ("长凳", "电动车", "cups", "cups-", "Bu\u0308gel"):
+        (tmp_path / name / "sparse").mkdir(parents=True)
+    told = {"cooling_bench": "长凳", "cooling_ebike": "电动车", "warming_cups": "cups-", "heat_transfer": "b\u00fcgel"}
+    assert rhd.find(tmp_path, told) == {**told, "heat_transfer": "Bu\u0308gel"}
+    assert rhd.find(tmp_path, told | {"warming_cups": "cups"})["warming_cups"] == "cups"
+    assert rhd.scene_of("电动车", told) == "cooling_ebike" and rhd.scene_of("杯子", told) is None
 
 
 def test_folders_are_told_on_the_command_line_by_the_scenes_of_the_table(tmp_path):

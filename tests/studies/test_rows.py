@@ -9,6 +9,8 @@ from hydra.core.hydra_config import HydraConfig
 from running import compose_run
 
 from heatsplat.contracts import SceneError
+from heatsplat.io.command_lines import as_dict
+from heatsplat.studies.finished import named_row
 from heatsplat.studies.published.figures import figures, quoted
 from heatsplat.studies.rows import Rows
 
@@ -28,6 +30,27 @@ def test_every_row_meets_every_combination_of_the_grid_and_a_grid_needs_no_rows(
         ["seed=0", "max_steps=5", "row='a'"], ["seed=0", "row='b'"], ["seed=1", "max_steps=5", "row='a'"], ["seed=1", "row='b'"]
     ]  # fmt: skip
     assert first == 0 and Rows().jobs(grid, nowhere) == (grid, 0)
+    loose = Rows({"a": None, 8: {"set": None}, "c": {"set": "max_steps=5"}})  # as people write them
+    assert loose.jobs([[]], nowhere)[0] == [["row='a'"], ["row='8'"], ["max_steps=5", "row='c'"]]
+    ((told,),), _ = Rows({"what's new": {}}).jobs([[]], nowhere)
+    assert compose_run("method=3dgs", told)["row"] == "what's new" == named_row(as_dict([told]))
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (
+            {"full": {}, "short": {"sets": ["max_steps=5"]}},
+            "rows: a row has set .* and printed, nothing else; short is {'sets",
+        ),
+        ({"short": ["max_steps=5"]}, r"short is \['max_steps"),
+        (["full", "short"], r"hydra.sweeper.rows=\['full', 'short'\]: give rows by name"),
+    ],
+)
+def test_a_row_that_would_not_be_what_it_is_called_is_refused(rows, message):
+    """Misspelled, it would be a second row of the default."""
+    with pytest.raises(SceneError, match=message):
+        Rows(rows)
 
 
 @pytest.mark.parametrize("path", ABLATIONS, ids=lambda path: path.stem)

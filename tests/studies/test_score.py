@@ -63,6 +63,7 @@ def test_half_a_degree_is_half_a_degree(root, submission, tmp_path):
         (lambda f: f.write_bytes(b"no image"), "cannot be read .* write float32 temperatures in °C, one channel"),
         (lambda f: (f.unlink(), np.save(f.with_suffix(".npy"), np.ones((12, 16), np.uint16))), "uint16; write float32"),
         (lambda f: write_temperature(f, truth(VIEWS[0]) - 500), "below absolute zero"),
+        (lambda f: np.save(f.with_suffix(".npy"), truth(VIEWS[0])), r"3.tiff and near_00003.npy are of one view: del"),
         (lambda f: renamed_archive(f, whole=True), r"near_00003.npy cannot be read \(several arrays, as of an .npz\); write"),
         (lambda f: renamed_archive(f, whole=False), "near_00003.npy cannot be read .* write float32"),
     ],

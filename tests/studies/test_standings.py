@@ -4,8 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
-from boards import ASKED, VIEWS, board, hand_in, protocol_folder, run_of, truth
+from boards import ASKED, VIEWS, board, hand_in, protocol_folder, run_of, submission, truth
 
+from heatsplat.io.results import RunResults
 from heatsplat.io.tiff import write_temperature
 from heatsplat.studies.leaderboard.plan import board_of
 from heatsplat.studies.leaderboard.standings import (
@@ -67,6 +68,73 @@ def test_a_seed_counts_once(tmp_path):
     (tmp_path / "other" / "3dgs_cooling_steps_0").rename(sweep / "etgs_cooling_steps_0")
     (entry,) = (one for one in standings(sweep, board(root)).entries if one.seeds)
     assert entry.all_numbers == [0] and entry.mean("mae_c") == pytest.approx(1.0, abs=1e-4)
+
+
+def test_a_run_that_cannot_be_read_takes_no_other_down(tmp_path, caplog):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
+    for seed, method in ((0, "3dgs"), (0, "etgs"), (1, "etgs")):
+        run_of(sweep, method, "cooling", seed, 1.0)
+    (sweep / "3dgs_cooling_steps_0" / "metrics.json").write_text("{")
+    (sweep / "etgs_cooling_steps_1" / ".hydra" / "overrides.yaml").write_text("{")
+    (sweep / "etgs_cooling_steps_0" / "score.json").write_text("{")
+    found = {one.method: one for one in standings(sweep, board(root)).entries}
+    assert found["etgs"].seeds == 1 and found["3dgs"].seeds == 0
+    assert (
+        "metrics.json is not a metrics.json of heatsplat" in found["3dgs"].reason and "Delete" in found["3dgs"].reason
+    )
+    assert "overrides.yaml cannot be read" in caplog.text
+
+
+def test_runs_of_other_settings_than_the_track_has_do_not_count(tmp_path):
+    """In a folder that is gone on with, or whose table is written anew, when the protocol has become another. What the command
+    line says for all runs comes after the track's and is meant."""
+    root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
+    run_of(sweep, "3dgs", "cooling", 0, 1.0)
+    run_of(sweep, "etgs", "cooling", 0, 1.0)
+    file = sweep / "etgs_cooling_steps_0" / ".hydra" / "overrides.yaml"
+    file.write_text(file.read_text() + "- max_steps=6\n")
+    assert [one.seeds for one in standings(sweep, board(root)).entries] == [1, 1, 0]
+    shorter = board(root, protocol=ASKED["protocol"] | {"tracks": {"steps": ["max_steps=500"]}})
+    found = standings(sweep, shorter).entries
+    assert [one.seeds for one in found] == [0, 0, 0]
+    assert (
+        "steps_0 was trained without max_steps=500 of the track steps; give another hydra.sweep.dir" in found[0].reason
+    )
+
+
+def test_scenes_that_are_not_asked_for_are_no_columns(tmp_path):
+    root = protocol_folder(tmp_path / "root", "cooling", "driven")
+    theirs = submission(tmp_path / "theirs", 0.1, scenes={"driven": None, "cooling": None})
+    hand_in(theirs / "driven", 0.1)
+    for scenes in (["cooling"], ["cooling", "driven"]):
+        found = standings(
+            tmp_path / "none", board(root, methods=["3dgs"], scenes=scenes, submissions=[str(theirs)])
+        ).entries
+        assert [one.scene for one in found if one.method == "theirs"] == scenes
+
+
+def test_scenes_may_have_names_that_take_quotes(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "Büro, Süd"), tmp_path / "sweep"
+    (job,) = board(root, methods=["3dgs"], seeds=[0]).jobs()
+    assert "data.scene='Büro, Süd'" in job
+    run_of(sweep, "3dgs", "'Büro, Süd'", 0, 1.0)
+    assert [one.seeds for one in standings(sweep, board(root, methods=["3dgs"])).entries] == [1]
+
+
+def test_the_machines_of_seconds_are_told(tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "sweep"
+    theirs = str(submission(tmp_path / "theirs", 0.1, machine="RTX 4090"))
+    for seed, threads in ((0, 1), (1, 4)):
+        run_of(sweep, "3dgs", "cooling", seed, 1.0)
+        file = sweep / f"3dgs_cooling_steps_{seed}" / "metrics.json"
+        results = RunResults.read(file)
+        results.run |= {"machine": "EPYC, 4 cores", "threads": threads}
+        results.write(file)
+    run_of(sweep, "etgs", "cooling", 0, 1.0)  # of a version that did not tell
+    assert standings(sweep, board(root, submissions=[theirs])).note == (
+        "Measured on EPYC, 4 cores, 1 thread (1 run); EPYC, 4 cores, 4 threads (1 run); RTX 4090 (1 run)."
+    )
+    assert standings(tmp_path / "none", board(root)).note == ""
 
 
 def test_a_score_of_a_scene_that_was_made_anew_is_worked_out_anew(tmp_path):

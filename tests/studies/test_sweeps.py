@@ -16,6 +16,7 @@ from heatsplat.composition import scene_name
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 from heatsplat.runs.resume import NOT_LEARNED
+from heatsplat.studies import sweeps
 from heatsplat.studies.finished import NOT_A_ROW, NOT_WHAT_WAS_LEARNED, read_runs, row_names, settings_of
 from heatsplat.studies.published.figures import quoted
 from heatsplat.studies.sweeps import collect, markdown, picture, write_sweep
@@ -53,6 +54,75 @@ def test_a_job_that_was_trained_again_counts_once(sweep, caplog):
     assert "2 jobs were trained more than once; each counts once" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("first", "again"),
+    [
+        (["seed=1"], ["seed=1", "launcher=joblib"]),
+        (["seed=1"], ["seed=1", "threads=1"]),
+        ([], ["seed=0"]),
+        (["seed=1", "row=x"], ["seed=1", "row='x'"]),
+        (["seed=1", "data.seed=1"], ["seed=1"]),
+    ],
+)
+def test_a_seed_counts_once_however_it_was_asked_for(first, again, tmp_path):
+    job(tmp_path, 0, first, 30.0)
+    job(tmp_path, 1, again, 31.0)
+    job(tmp_path, 2, [*(text for text in again if "seed=" not in text), "seed=5"], 33.0)
+    (row,) = collect(tmp_path)
+    assert row.values("psnr") == [31.0, 33.0]
+
+
+def test_seconds_of_several_machines_or_threads_are_told(sweep):
+    """As of a sweep that went on with another launcher, which gives its jobs other threads."""
+
+    def text(**run):
+        (path,) = sweep.glob(f"*_0_x/{METRICS_FILE}")
+        results = RunResults.read(path)
+        results.run |= run
+        results.write(path)
+        return markdown(collect(sweep), {})
+
+    for number in (1, 2, 3):
+        (path,) = sweep.glob(f"*_{number}_x/{METRICS_FILE}")
+        results = RunResults.read(path)
+        results.run |= {"machine": "EPYC, 4 cores", "threads": 4}
+        results.write(path)
+    assert "Seconds" not in text() + text(machine="EPYC, 4 cores", threads=4)
+    told = "compare within one: EPYC, 4 cores, 1 thread (1 run); EPYC, 4 cores, 4 threads (3 runs)."
+    assert told in text(threads=1)
+
+
+def test_runs_of_several_versions_are_told(sweep):
+    """As of a sweep that got another seed after an update."""
+    for number, commit in ((0, "fcb7dfd630"), (1, "fcb7dfd630"), (2, "343e0805aa"), (3, None)):
+        (path,) = sweep.glob(f"*_{number}_x/{METRICS_FILE}")
+        results = RunResults.read(path)
+        results.versions = {"heatsplat": "0.1.0", "git_commit": commit}
+        results.write(path)
+    told = "several versions of heatsplat: 0.1.0 (1 run); 0.1.0 343e0805 (1 run); 0.1.0 fcb7dfd6 (2 runs)."
+    assert told in markdown(collect(sweep), {})
+    for number in (2, 3):
+        (path,) = sweep.glob(f"*_{number}_x/{METRICS_FILE}")
+        path.unlink()
+    assert "several versions" not in markdown(collect(sweep), {})
+
+
+def test_recordings_of_a_scene_are_seeds_of_their_own(tmp_path):
+    for number, own in enumerate((["data.scene_seed=0"], ["data.scene_seed=1"], ["data.seed=1"])):
+        job(tmp_path, number, ["seed=0", *own], 30.0 + number)
+    (row,) = collect(tmp_path)
+    assert row.count == 3
+
+
+def test_experiments_that_are_swept_are_rows_of_their_own(tmp_path):
+    for number, (name, seed) in enumerate(itertools.product(("one", "two"), (0, 1))):
+        job(tmp_path, number, [f"experiment={name}", f"seed={seed}"], 30.0 + number)
+    assert {row.label: row.mean("psnr") for row in collect(tmp_path)} == {
+        "experiment=one": 30.5,
+        "experiment=two": 32.5,
+    }
+
+
 def test_the_table_is_written_for_people_programs_and_eyes(sweep):
     written = write_sweep(sweep, ["K = 24", "K = 8"], {"K = 24": quoted("etgs", "4", "K=24", ["average"])})
     assert [path.name for path in written] == ["table.md", "table.csv", "table.png"]
@@ -82,7 +152,7 @@ def test_own_scores_are_columns_with_their_units(sweep):
     write_sweep(sweep)
     text = (sweep / "table.md").read_text()
     assert "| PSNR (dB) | MAE (°C) | rmse_c (°C) | steps_seen | train (s) |" in text and "none_at_all" not in text
-    assert "| 0.4623 ± 0.0707 | – |" in text and "| – | 1,234 |" in text
+    assert "| 0.4623 ± 0.0707 | – |" in text and "| – | 1,234 (1 of 2) |" in text
     with open(sweep / "table.csv", newline="") as file:
         first, second, *_ = csv.DictReader(file)
     assert (
@@ -92,7 +162,7 @@ def test_own_scores_are_columns_with_their_units(sweep):
     )
 
 
-def test_scores_of_different_scenes_stand_in_panels_of_their_own(tmp_path):
+def test_scores_of_different_scenes_stand_in_panels_of_their_own(tmp_path, monkeypatch):
     for number, (method, scene) in enumerate([("etgs", "cooling"), ("3dgs", "static")]):
         job(tmp_path, number, [f"method={method}", f"data.scene={scene}"], 30.0 + number, scene=scene)
     assert "No two rows are of one scene" in markdown(collect(tmp_path), {})
@@ -101,6 +171,8 @@ def test_scores_of_different_scenes_stand_in_panels_of_their_own(tmp_path):
     assert "No two rows" not in markdown(rows, {})
     panels = picture(rows).axes
     assert [axes.get_title() for axes in panels] == ["cooling", "cooling", "static", "static"]
+    monkeypatch.setattr(sweeps, "DRAWN", 1)
+    assert len(picture(rows).axes) == 2 and picture(rows).get_suptitle() == "the first 1 of 2 scenes; the table has all"
     labels = [axes.get_legend_handles_labels()[1] for axes in panels]
     assert [len(each) for each in labels] == [2, 2, 1, 1]
 
@@ -200,6 +272,24 @@ def test_a_row_of_several_methods_is_a_row_for_each(tmp_path):
     for number, method in enumerate(("etgs", "3dgs")):
         job(tmp_path, number, [f"method={method}", "row=plain"], 30.0 + number)
     assert {row.label: row.mean("psnr") for row in collect(tmp_path)} == {"plain, etgs": 30.0, "plain, 3dgs": 31.0}
+
+
+def test_jobs_of_which_nothing_can_be_read_are_told_one_by_one(sweep):
+    for number in (1, 3):
+        (path,) = sweep.glob(f"*_{number}_x")
+        (path / ".hydra" / "overrides.yaml").write_text("{")
+    table = markdown(collect(sweep), {})
+    assert table.count("overrides.yaml cannot be read") == 2 and "Jobs without a result: 4" in table
+
+
+def test_scores_that_have_the_name_of_a_column_take_no_other_down(sweep):
+    (path,) = sweep.glob(f"*_0_x/{METRICS_FILE}")
+    results = RunResults.read(path)
+    for name in ("failed", "results", "name"):
+        results.put("test", name, 1.0)
+    results.write(path)
+    assert next(row for row in collect(sweep) if row.name == "K = 8").count == 2
+    assert "| row | runs | PSNR (dB) | MAE (°C) | train (s) |" in markdown(collect(sweep), {})
 
 
 def test_results_that_cannot_be_read_are_told_beside_the_others(sweep):
@@ -366,8 +456,11 @@ def test_runs_are_found_in_a_folder_at_any_depth_but_not_within_each_other(tmp_p
         (tmp_path / place).mkdir(parents=True)
         (tmp_path / place / FAILED).write_text("RuntimeError: broken")
     expected = [tmp_path / "a/one", tmp_path / "b/deep/two"]
-    for folders in (tmp_path, str(tmp_path), [str(tmp_path)], expected):
+    for folders in (tmp_path, str(tmp_path), [str(tmp_path)], expected, [tmp_path, tmp_path / "b"]):
         assert read_runs(folders)["folder"].tolist() == expected
+    (tmp_path / "a" / "latest").symlink_to("one")
+    (tmp_path / "b" / "deep" / "above").symlink_to("..")
+    assert read_runs(tmp_path)["folder"].tolist() == expected
     (tmp_path / "empty").mkdir()
     with pytest.raises(SceneError, match="empty holds no run"):
         read_runs([tmp_path / "empty"])

@@ -24,6 +24,13 @@ def test_seeds_of_a_recipe_are_one_row_whatever_their_lengths():
     assert row.startswith("| budget | 2 | ≈ 306 | 30.0 ± 0.0 |") and "41.00 ± 1.41" in row
 
 
+def test_fields_have_no_gaussians_to_compare():
+    panel = a_panel()
+    panel.outcomes[:] = [replace(one, gaussians=0.0) for one in panel.outcomes]
+    panel.references["0"] = panel.outcomes[-1]
+    assert all(line.endswith("| 0 | – |") for line in ends(panel)[2:])
+
+
 def test_times_have_a_dash_where_the_accuracy_is_not_reached():
     lines = {line.split("|")[1].strip(): line for line in times(a_panel(), "end")}
     assert lines["early"].count("–") == 6
@@ -49,3 +56,12 @@ def test_the_picture_shows_the_ends_whatever_a_reset_throws_back():
     ]
     assert levels == pytest.approx([41.0, 40.8])
     assert "processor seconds" in markdown([panel], "cpu_seconds").partition("\n")[0]
+
+
+def test_seconds_beside_a_reference_of_another_machine_are_told():
+    panel = a_panel()
+    panel.outcomes[:] = [replace(one, on="EPYC, 4 threads") for one in panel.outcomes]
+    assert "Seconds are of" not in markdown([panel], "train_seconds")
+    panel.outcomes[0] = replace(panel.outcomes[0], on="Xeon, 4 threads")
+    told = "within one: EPYC, 4 threads (3 runs); Xeon, 4 threads (1 run).\n"
+    assert told in markdown([panel], "train_seconds")

@@ -7,7 +7,6 @@ import pytest
 import yaml
 from matplotlib.figure import Figure
 
-from heatsplat import cli
 from heatsplat.composition import compose
 from heatsplat.contracts import SceneError
 from heatsplat.io.results import METRICS_FILE, RunResults
@@ -15,7 +14,6 @@ from heatsplat.studies.time_to_accuracy import study as time_to_accuracy
 from heatsplat.studies.time_to_accuracy.runs import Outcome
 from heatsplat.studies.time_to_accuracy.study import run
 
-CONFIG = Path(cli.CONF) / "study" / "time_to_accuracy.yaml"
 REFERENCE, RECIPES = ["max_steps=800"], {"quick": ["preset=fast"]}
 
 
@@ -134,14 +132,18 @@ def test_methods_and_scenes_have_panels_and_references_of_their_own(runs, tmp_pa
     made(runs / "other", ["max_steps=800"], 800, 60.0, 33.0, method="3dgs")
     made(runs / "other_quick", ["preset=fast", "seed=0"], 200, 6.0, 32.0, method="3dgs")
     made(runs / "lone", ["preset=fast", "seed=7"], 200, 6.0, 32.0, method="3dgs")
-    made(runs / "twice", ["preset=fast", "seed=0", "threads=2"], 190, 1.0, 32.0, method="3dgs")
+    made(runs / "before", ["preset=fast", "seed=0", "threads=2"], 190, 1.0, 32.0, method="3dgs")
+    made(runs / "table", ["preset=fast", "seed=1", "experiment=table_etgs_1"], 200, 5.0, 30.0)
     panels = {panel.title: panel for panel in run(tmp_path / "out", str(runs), REFERENCE, RECIPES)}
     assert set(panels) == {"etgs on heated", "3dgs on heated"}
+    names = {one.recipe for one in panels["etgs on heated"].outcomes}
+    assert {"quick", "experiment=table_etgs_1 preset=fast"} <= names  # which sets more
     found = panels["3dgs on heated"]
-    assert [(one.recipe, one.seed, one.seconds) for one in found.outcomes] == [(None, "0", 60.0), ("quick", "0", 6.0)]
+    outcomes = [own for group in found.groups() for own in group]
+    assert [(one.recipe, one.seed, one.seconds) for one in outcomes] == [(None, "0", 60.0), ("quick", "0", 6.0)]
     assert "3dgs on heated, quick, seed 7 is left out: there is no reference with this seed" in caplog.text
-    assert "twice is left out: another run of its recipe and seed" in caplog.text
-    assert found.standard_in(found.outcomes[1]) is None  # one length says nothing of others
+    assert "before is left out: a later run of its recipe and seed counts" in caplog.text
+    assert found.standard_in(outcomes[1]) is None  # one length says nothing of others
 
 
 def test_a_scene_without_temperatures_is_measured_by_psnr_alone(tmp_path, no_pictures):
@@ -161,6 +163,9 @@ def test_a_scene_without_temperatures_is_measured_by_psnr_alone(tmp_path, no_pic
     [
         ({"reference": ["max_steps=9"]}, r"there is no finished run of the reference \(max_steps=9\)"),
         ({"reference": ["density=adaptive"]}, "give its length too"),
+        ({"reference": ["max_steps=3e4"]}, "give its length too, a whole number"),
+        ({"psnr_margin_db": "abc"}, "study.psnr_margin_db must be a number, got abc"),
+        ({"mae_margin_c": None}, "study.mae_margin_c must be a number, got None"),
         ({"clock": "wall"}, "study.clock must be one of train_seconds, cpu_seconds, got 'wall'"),
         ({"cases": {"a": ["method=etgs"]}, "seeds": []}, r"study.seeds=\[\] has nothing in it"),
         ({"cases": {"a": ["method=etgs"]}, "lengths": ["long"]}, "study.lengths must be a whole number"),
@@ -192,12 +197,11 @@ def test_missing_runs_are_trained_and_finished_ones_are_not(runs, tmp_path, monk
     (panel,) = run(
         tmp_path / "out", str(runs), REFERENCE, RECIPES | {"other": ["density=proximity", "max_steps=200"]},
         cases={"case": ["method=etgs", "data.scene=heated"]}, lengths=[100, 300, 400], seeds=[0, 2],
-        overrides=["callbacks.images=null", "dtype=float64"],
+        overrides=["dtype=float64"], threads=1,
     )  # fmt: skip
     told = {tuple(text for text in overrides[4:]) for overrides in asked}
     assert all(
-        overrides[:4] == ["callbacks.images=null", "dtype=float64", "method=etgs", "data.scene=heated"]
-        for overrides in asked
+        overrides[:4] == ["threads=1", "dtype=float64", "method=etgs", "data.scene=heated"] for overrides in asked
     )
     assert told == {
         ("max_steps=300", "seed=0"), ("density=proximity", "max_steps=200", "seed=0"),
@@ -234,9 +238,9 @@ def test_what_a_case_says_beside_its_scene_makes_a_panel_and_no_other_recipe(tmp
 
 def test_the_configuration_asks_for_what_there_is():
     """Every recipe of the study composes, on the scene of its comment."""
-    study = yaml.safe_load(CONFIG.read_text())
+    study = compose(["study=time_to_accuracy"], "study")["study"]
     assert compose([*study["reference"], "method=etgs"])["max_steps"] == 30000
-    overrides = [text for text in study["overrides"] if "$" not in text]
+    overrides = study["overrides"]
     for recipe in study["recipes"].values():
         config = compose([*overrides, "method=etgs", "data.scene=heated", *recipe])
-        assert config["max_steps"] <= 30000 and config["callbacks"]["images"] is None
+        assert config["max_steps"] <= 30000 and config["callbacks"]["images"] is config["threads"] is None

@@ -117,9 +117,9 @@ def test_a_run_without_the_score_gives_no_verdict(world, tmp_path, monkeypatch, 
 
 
 def test_the_report_says_what_all_runs_have_and_with_which_seeds_they_are_compared(world, tmp_path):
-    tune.run(tmp_path, CASES, trials=2, seeds=[3, 1], overrides=["data.downscale=2", "threads=1"])
+    tune.run(tmp_path, CASES, trials=2, seeds=[3, 1], overrides=["data.downscale=2"], threads=1)
     text = (tmp_path / "tune.md").read_text()
-    assert "All rows: `data.downscale=2 threads=1`." in text and "beside the default, seeds 3, 1\n" in text
+    assert "All rows: `threads=1 data.downscale=2`." in text and "beside the default, seeds 3, 1\n" in text
     assert "| gain in PSNR (dB) | verdict |" in text
 
 
@@ -232,8 +232,11 @@ def test_without_optuna_its_extra_is_named(monkeypatch, tmp_path):
 
 
 def test_settings_and_scenes_of_the_study_exist():
-    """Each knob is a key of its method, whose default lies in its range, and each scene composes."""
+    """Each knob is a key of its method, whose default lies in its range, and each scene composes. Nothing is None as text,
+    such as threads of null that stand within another."""
     config = compose(["study=tune"], "study")["study"]
+    assert config["threads"] is None and compose(config["overrides"])["threads"] is None
+    assert compose(["study=tune", "threads=2"], "study")["study"]["threads"] == 2
     for method, case in config["cases"].items():
         run = compose([f"method={method}", *case["scene"], f"max_steps={config['search_steps']}"])
         for key, values in case["knobs"].items():

@@ -15,7 +15,12 @@ CONFIG = Path(".hydra") / "config.yaml"
 
 def overrides_of(place: Path) -> dict[str, str]:
     """What the command line said of the run in a folder: key -> value, as text; empty where nothing was written down."""
-    return as_dict(map(str, _read(place / OVERRIDES, list)))
+    return as_dict(told_of(place))
+
+
+def told_of(place: Path) -> list[str]:
+    """The arguments of the command line themselves, of which a key may have several; the last of them counts."""
+    return [*map(str, _read(place / OVERRIDES, list))]
 
 
 def config_of(place: Path) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def over_seeds(values: Sequence[float], digits: int) -> str:
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]], align: str = "") -> list[str]:
-    """Lines of a Markdown table; bars within cells are escaped.
+    """Lines of a Markdown table; bars within cells are escaped, and a cell is one line.
 
     Args:
         head: titles of the columns.
@@ -58,7 +58,8 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]], align: st
 
 
 def _line(cells: Iterable[Any]) -> str:
-    return "| " + " | ".join(re.sub(r"(?<!\\)\|", r"\|", str(cell)) for cell in cells) + " |"
+    lines = (" ".join(str(cell).splitlines()) for cell in cells)
+    return "| " + " | ".join(re.sub(r"(?<!\\)\|", r"\|", line) for line in lines) + " |"
 
 
 def write_csv(path: Path | str, rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
@@ -80,9 +81,16 @@ def write_csv(path: Path | str, rows: Iterable[Mapping[str, Any]], columns: Sequ
 
 
 def read_csv(path: Path | str) -> list[dict[str, float | str | None]]:
-    """Rows of a file that ``write_csv`` wrote, numbers as floats and empty cells as None."""
+    """Rows of a file that ``write_csv`` wrote, numbers as floats and empty cells as None.
+
+    Raises:
+        ValueError: a row has more cells than there are columns, as of two lines in one.
+    """
     with open(path, newline="", encoding="utf-8") as file:
-        return [{key: _value(text) for key, text in row.items()} for row in csv.DictReader(file)]
+        rows = [*csv.DictReader(file)]
+    if broken := next((number for number, row in enumerate(rows, 1) if None in row), None):
+        raise ValueError(f"{path}: row {broken} has more cells than columns")
+    return [{key: _value(text) for key, text in row.items()} for row in rows]
 
 
 def _value(text: str) -> float | str | None:

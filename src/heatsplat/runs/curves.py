@@ -114,7 +114,7 @@ def read_points(path: Path = CURVES_FILE) -> list[Point]:
     Columns that are no number of a point are overrides; where they are empty, the run had none of this key.
 
     Raises:
-        SceneError: the file is not one, or empty.
+        SceneError: the file is not one, or empty, or has several rows of one run.
     """
     try:
         with open(path, newline="", encoding="utf-8") as file:
@@ -137,6 +137,8 @@ def read_points(path: Path = CURVES_FILE) -> list[Point]:
             raise ValueError("it has no rows")
         if not all(min(p.steps, p.growth, p.mean_growth, p.cost) > 0 and math.isfinite(p.psnr) for p in points):
             raise ValueError("steps, growth, mean_growth and cost must be above zero, psnr finite")
+        if twice := [point for point, count in Counter(map(_which, points)).items() if count > 1]:
+            raise ValueError(f"several rows are of one run: {', '.join(twice[0])}")
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise SceneError(
             f"{path} holds no curves: {error!r}. Measure them with python src/study.py study=budget, which writes them to "
@@ -147,12 +149,13 @@ def read_points(path: Path = CURVES_FILE) -> list[Point]:
 
 def merged(kept: Iterable[Point], measured: Iterable[Point]) -> list[Point]:
     """The points of both; where the same run was measured anew, the new one."""
+    return list(({_which(point): point for point in kept} | {_which(point): point for point in measured}).values())
 
-    def key(point: Point) -> tuple[str, ...]:  # numbers as a file holds them
-        numbers = f"{point.growth:.3g}", f"{point.decay:.3g}"
-        return point.method, point.scene, str(point.steps), *numbers, *point.settings
 
-    return list(({key(point): point for point in kept} | {key(point): point for point in measured}).values())
+def _which(point: Point) -> tuple[str, ...]:
+    """The run that a point is of, with numbers as a file holds them."""
+    numbers = f"{point.growth:.3g}", f"{point.decay:.3g}"
+    return point.method, point.scene, str(point.steps), *numbers, *point.settings
 
 
 def write_points(points: Iterable[Point], path: Path) -> None:

@@ -35,7 +35,7 @@ def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
     if changed:
         raise OccupiedError(
             f"{folder} holds the results of a run with other settings ({shortened(changed)}): give another folder with "
-            "hydra.run.dir, or delete that one"
+            "hydra.run.dir (of a sweep: hydra.sweep.dir), or delete that one"
         )
     return RunResults.read(folder / METRICS_FILE)
 
@@ -45,7 +45,7 @@ def _given_otherwise(folder: Path, config: dict[str, Any]) -> list[str]:
     if not (folder / OVERRIDES).exists():
         raise OccupiedError(
             f"{folder} holds results without a checkpoint that tells of which settings they are: give another folder with "
-            "hydra.run.dir, or delete that one"
+            "hydra.run.dir (of a sweep: hydra.sweep.dir), or delete that one"
         )
     before, now = learned_by(overrides_of(folder)), learned_by(as_dict(config["overrides"]))
     return sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))

@@ -11,7 +11,7 @@ from typing import Any
 from heatsplat.composition import compose, followed, overlap, run_of
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
-from heatsplat.io.command_lines import keys_of
+from heatsplat.io.command_lines import keys_of, setting, typed
 from heatsplat.io.results import checkpoint_of
 from heatsplat.io.settings import at
 from heatsplat.runs.lock import OccupiedError
@@ -147,8 +147,14 @@ def stored_config(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 def learned_by(overrides: Mapping[str, str]) -> dict[str, str]:
     """Those of the overrides that say what a run learns: not where and how it runs."""
-    without = NOT_LEARNED | {"launcher"}
-    return {key: value for key, value in overrides.items() if key.lstrip("+~").partition(".")[0] not in without}
+
+    def says_it(key: str) -> bool:
+        group, _, name = key.lstrip("+~").partition(".")
+        if group in LEARNED:  # an option of the group, such as callbacks=plateau, may hold it
+            return not name or name.partition(".")[0] in LEARNED[group]
+        return group not in NOT_LEARNED | {"launcher"}
+
+    return {key: value for key, value in overrides.items() if says_it(key)}
 
 
 def shortened(names: Sequence[str]) -> str:
@@ -160,17 +166,17 @@ def shortened(names: Sequence[str]) -> str:
 def _check_own(config: dict[str, Any], output_dir: Path, path: Path, checkpoint: Mapping[str, Any]) -> None:
     """Raises OccupiedError where a checkpoint in a run's folder is of other settings."""
     if changed := differences(config, stored_config(checkpoint)):
-        step = checkpoint.get("global_step")
+        step, ckpt = checkpoint.get("global_step"), typed(setting("ckpt", path))
         if len(new_in(config, stored_config(checkpoint), changed)) == len(changed):
             raise OccupiedError(
                 f"{output_dir} holds an unfinished run of an older heatsplat, which did not have "
-                f"{shortened(changed)}: ckpt={path} hydra.run.dir={output_dir} goes on from step {step}, and they "
+                f"{shortened(changed)}: {ckpt} {typed(setting('hydra.run.dir', output_dir))} goes on from step {step}, and they "
                 "count from there on; or delete that folder (of a sweep: that of the job), and the same command trains it anew"
             )
         raise OccupiedError(
             f"{output_dir} holds an unfinished run with other settings ({shortened(changed)}), of which "
-            f"{path.name} is of step {step}: give another folder with hydra.run.dir; or go on with that "
-            f"run, with its settings and ckpt={path}; or delete that folder"
+            f"{path.name} is of step {step}: give another folder with hydra.run.dir (of a sweep: hydra.sweep.dir); or go on "
+            f"with that run, with its settings and {ckpt}; or delete that folder"
         )
 
 

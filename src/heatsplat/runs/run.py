@@ -24,7 +24,7 @@ from heatsplat.doctor.examination import FINDINGS_FILE, warn_of, write_findings
 from heatsplat.geometry.coverage import Sighting, covered
 from heatsplat.io.results import RunResults, checkpoint_of
 from heatsplat.runs.budget import budgeted
-from heatsplat.runs.checks import check_copied, check_last_stage, checked
+from heatsplat.runs.checks import check_copied, check_last_stage, check_threads, checked
 from heatsplat.runs.declared import declared
 from heatsplat.runs.device import device_of
 from heatsplat.runs.folder import results_in
@@ -107,6 +107,7 @@ def begin(config: dict[str, Any], output_dir: Path) -> Run:
 
 def _opened(config: dict[str, Any], output_dir: Path) -> tuple[dict[str, Any], dict[str, Any], Any]:
     """A configuration as it was composed and as it goes on, and the data that it names."""
+    check_threads(config["threads"])
     prepare_machine(config["threads"])
     composed = checked(config)
     config = resumed(composed, output_dir)

@@ -6,13 +6,13 @@ import logging
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from heatsplat.composition import further_places
 from heatsplat.contracts import SceneError
-from heatsplat.io.command_lines import key_of, setting
+from heatsplat.io.command_lines import as_dict, key_of, setting, typed
 from heatsplat.io.recorded import OVERRIDES, overrides_of
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 
@@ -41,8 +41,7 @@ def train_or_read(place: Path, train: str | None, overrides: Sequence[str], stud
     """
     if (place / METRICS_FILE).exists():
         if (place / OVERRIDES).exists():
-            before = [f"{key}={value}" for key, value in overrides_of(place).items()]
-            refuse_others(place, _settings(before), _settings(overrides))
+            refuse_others(place, _settings(overrides_of(place)), _settings(as_dict(overrides)))
         return RunResults.read(place / METRICS_FILE)
     log.info("training %s", place)
     program = [train] if train else ["-c", INSTALLED]
@@ -52,7 +51,7 @@ def train_or_read(place: Path, train: str | None, overrides: Sequence[str], stud
         failed = place / FAILED
         raise SceneError(
             f"a run of the study failed; {failed if failed.exists() else 'its output'} says why. When that is mended, the "
-            f"same command with hydra.run.dir={study} goes on with what is left.\nFolder of the run: {place}\n"
+            f"same command with {typed(setting('hydra.run.dir', study))} goes on with what is left.\nFolder of the run: {place}\n"
             f"Command: {shlex.join(command)}\nOutput:\n{(done.stderr or done.stdout)[-2000:]}"
         )
     return RunResults.read(place / METRICS_FILE)
@@ -91,5 +90,5 @@ def all_rows(overrides: Iterable[str], **found: Iterable[Any]) -> str:
     return f"All rows: `{' '.join(words)}`."
 
 
-def _settings(overrides: Iterable[str]) -> list[str]:
-    return [text for text in overrides if key_of(text) not in WHERE_IT_LIES]
+def _settings(overrides: Mapping[str, str]) -> list[str]:
+    return [f"{key}={value}" for key, value in overrides.items() if key_of(key) not in WHERE_IT_LIES]

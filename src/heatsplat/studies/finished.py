@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import statistics
 from collections import Counter
@@ -12,10 +13,28 @@ from typing import Any
 
 import pandas as pd
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, counted
 from heatsplat.io.recorded import CONFIG, OVERRIDES, config_of, overrides_of
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 
+log = logging.getLogger(__name__)
+
+# Columns of a table of runs that are no score; a score of this name, of a callback that is not ours, has none.
+COLUMNS = {
+    "folder",
+    "scene",
+    "method",
+    "row",
+    "overrides",
+    "failed",
+    "results",
+    "data",
+    "name",
+    "other",
+    "title",
+    "measured",
+    "course",
+}
 # Overrides that make no other recipe. runs.resume.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of
 # folders, are among them; the method is named by itself.
 SEEDS = {"seed", "data.seed", "data.scene_seed"}
@@ -75,7 +94,8 @@ class Runs:
 
 
 def read_runs(folders: Iterable[Path | str] | Path | str) -> pd.DataFrame:
-    """A row for each run, in the order of the folders; of a folder that is no run a row for each that lies below it.
+    """A row for each run, in the order of the folders; of a folder that is no run a row for each that lies below it. A run that
+    is reached twice, as by a link to the latest, has one.
 
     Columns: folder, scene, method, row (of a sweep, "" for none), overrides (key -> value), failed (why there are no results,
     None where there are), results (None where there are none), data (the options of the data), then every score of the test
@@ -85,25 +105,36 @@ def read_runs(folders: Iterable[Path | str] | Path | str) -> pd.DataFrame:
         SceneError: a folder is none, or has no run in it.
     """
     places = [folders] if isinstance(folders, Path | str) else folders
-    return pd.DataFrame([_read(run) for place in places for run in _runs_in(Path(place))])
+    runs: dict[Path, Path] = {}
+    for run in (run for place in places for run in _runs_in(Path(place))):
+        runs.setdefault(run.resolve(), run)
+    return pd.DataFrame([_read(run) for run in runs.values()])
 
 
 def _runs_in(place: Path) -> list[Path]:
     if not place.is_dir():
         raise SceneError(f"there is no folder {place}")
-    found = list(_runs_below(place))
+    found = list(_runs_below(place, set()))
     if not found:
         raise SceneError(f"{place} holds no run, nor does any folder below it: a run has {METRICS_FILE} or {OVERRIDES}")
     return found
 
 
-def _runs_below(place: Path) -> Iterator[Path]:
-    """The folder itself where it is one of a run; else those below it, but none within a run, such as of its evaluations."""
+def _runs_below(place: Path, seen: set[Path]) -> Iterator[Path]:
+    """The folder itself where it is one of a run; else those below it, but none within a run, such as of its evaluations.
+
+    Links come last, and those to a folder that was seen, such as the one above, are passed over.
+    """
+    if (real := place.resolve()) in seen:
+        return
+    seen.add(real)
     if any((place / name).exists() for name in (METRICS_FILE, FAILED, OVERRIDES, CONFIG)):
         yield place
         return
-    for inner in sorted(path for path in place.iterdir() if path.is_dir()):
-        yield from _runs_below(inner)
+    for inner in sorted(
+        (path for path in place.iterdir() if path.is_dir()), key=lambda path: (path.is_symlink(), path)
+    ):
+        yield from _runs_below(inner, seen)
 
 
 def _read(folder: Path) -> dict[str, Any]:
@@ -123,7 +154,9 @@ def _read(folder: Path) -> dict[str, Any]:
         "row": named_row(overrides), "overrides": overrides, "failed": failed, "results": results,
         "data": _data(config),
     }  # fmt: skip
-    return found if results is None else found | results.test | results.cost
+    if results is None:
+        return found
+    return found | {name: value for name, value in (results.test | results.cost).items() if name not in COLUMNS}
 
 
 def _scene(config: Mapping[str, Any]) -> str:
@@ -146,6 +179,58 @@ def reason_of(folder: Path) -> str:
     lines = [line.strip() for line in (folder / FAILED).read_text(encoding="utf-8").splitlines() if line.strip()]
     named = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)]
     return (named or lines or ["failed"])[-1]
+
+
+def each_seed_once(runs: pd.DataFrame, rows: Sequence[Hashable]) -> pd.DataFrame:
+    """The runs without those that were trained more than once: of each row and seed the last that has results, else the last.
+
+    Args:
+        runs: of ``read_runs``.
+        rows: of each the row that it is of, with its scene.
+    """
+    seeds = [
+        seeds_of(run.overrides, run.results)
+        if run.overrides or run.results
+        else run.folder  # of which nothing is known
+        for run in runs.itertuples()
+    ]
+    told = runs.assign(which=[*zip(rows, seeds, strict=True)], done=runs["failed"].isna())
+    kept = told.sort_values("done", kind="stable").drop_duplicates("which", keep="last").index
+    if twice := runs.loc[~runs.index.isin(kept), "folder"].tolist():
+        log.warning("%d jobs were trained more than once; each counts once, without %s", len(twice), twice[0])
+    return runs.loc[runs.index.isin(kept)].reset_index(drop=True)
+
+
+def seeds_of(overrides: Mapping[str, str], results: RunResults | None) -> tuple[str, str, str]:
+    """Of training, of the order of views and of a synthetic scene."""
+    given = {key.lstrip("+~"): value.strip("'\"") for key, value in overrides.items()}
+    seed = str(given.get("seed", "0") if results is None else results.run.get("seed", given.get("seed", "0")))
+    return seed, given.get("data.seed", seed), given.get("data.scene_seed", "0")
+
+
+def ran_on(results: RunResults) -> str:
+    """The machine and the threads of a run, as far as it tells them."""
+    machine, threads = results.run.get("machine"), results.run.get("threads")
+    return ", ".join(filter(None, [machine, None if threads is None else counted(threads, "thread")]))
+
+
+def clocks(places: Iterable[str]) -> str:
+    """What is said of seconds of runs that ran on several machines or numbers of threads (``ran_on``); empty for one of each."""
+    return _several("Seconds are of several machines or numbers of threads, and compare within one", places)
+
+
+def versions(results: Iterable[RunResults]) -> str:
+    """What is said of runs of several versions of heatsplat, as of a sweep that went on after an update; empty for one."""
+    told = ([str(one.versions.get(key) or "") for key in ("heatsplat", "git_commit")] for one in results)
+    texts = (f"{number} {commit[:8]}".strip() for number, commit in told)
+    return _several("Runs are of several versions of heatsplat", texts)
+
+
+def _several(what: str, told: Iterable[str]) -> str:
+    """A sentence with each of the texts and how many runs tell it; empty where all that tell one tell the same."""
+    runs = Counter(text for text in told if text)
+    listed = "; ".join(f"{text} ({counted(count, 'run')})" for text, count in sorted(runs.items()))
+    return f"{what}: {listed}." if len(runs) > 1 else ""
 
 
 # Names ---------------------------------------------------------------------------------------------------------------
@@ -187,7 +272,8 @@ def told_apart(names: Sequence[Hashable], jobs: Sequence[Mapping[str, str]]) -> 
     """
 
     def is_meant(key: str) -> bool:
-        return not _makes_a_recipe(key) and key not in SEEDS | NAMES and key.partition(".")[0] not in WHOSE_JOB
+        named = SEEDS | NAMES - {"experiment"}  # which sets what no override tells
+        return not _makes_a_recipe(key) and key not in named and key.partition(".")[0] not in WHOSE_JOB
 
     left = [
         {name: f"{key}={value}" for key, value in sorted(own.items()) if is_meant(name := key.lstrip("+~"))}
@@ -213,7 +299,7 @@ def unshared(names: Sequence[Hashable], settings: Sequence[Sequence[str]]) -> li
 
 def named_row(overrides: Mapping[str, str]) -> str:
     """Name of the row that a job was given (``row=``), empty for none."""
-    name = overrides.get("row", "").strip("'\"")
+    name = overrides.get("row", "").strip("'\"").replace("\\'", "'")
     return "" if name == "null" else name
 
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from heatsplat.contracts import SceneError
 from heatsplat.io.pictures import literal
 from heatsplat.io.settings import at, walk
-from heatsplat.studies.finished import Runs
+from heatsplat.studies.finished import Runs, seeds_of
 from heatsplat.studies.options import listed
 from heatsplat.studies.sweep_plan import FolderOf, Overrides, SweepPlan
 from heatsplat.studies.sweeps import collect, write_sweep
@@ -169,11 +169,11 @@ def beside_default(row: Runs, rows: Sequence[Runs], name: str) -> float | None:
     return statistics.fmean(both) if both else None
 
 
-def _by_seed(row: Runs, name: str) -> dict[str, float]:
+def _by_seed(row: Runs, name: str) -> dict[tuple[str, ...], float]:
     if name not in row.table:
         return {}
     known = row.table[row.table[name].notna()]
-    return {run["overrides"].get("seed", ""): run[name] for _, run in known.iterrows()}
+    return {seeds_of(run["overrides"], run["results"]): run[name] for _, run in known.iterrows()}
 
 
 def picture(rows: Sequence[Runs]) -> Figure | None:

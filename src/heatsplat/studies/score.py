@@ -14,18 +14,22 @@ import numpy as np
 import torch
 
 from heatsplat.contracts import SceneError, ThermalRange, check_option, is_number
+from heatsplat.io.command_lines import setting, typed
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.io.tables import markdown_table, number, write_csv
 from heatsplat.io.tiff import read_temperature
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.metrics.scores import Scorer, mean_of_images
+from heatsplat.studies.options import subset_of
 
 log = logging.getLogger("heatsplat")
 
 META, SCENES, TRUTH = "meta.json", "scenes", "truth"
 ENDINGS = (".tiff", ".tif", ".npy")
 COSTS = ("seconds", "memory_mb", "gaussians")  # of a scene, in a submission's metrics.json
+# Scores that renders alone tell.
+OF_RENDERS = ("mae_c", "psnr", "ssim", "mae_inlier_c", "mae_roi_c", "mae_roi_inlier_c")
 ABSOLUTE_ZERO_C = -273.15
 MANY = 0.2  # share of a scene's pixels outside of the camera's bounds from which on they may be no °C
 
@@ -62,7 +66,7 @@ def score_scene(handed_in: Path, scene: Path, truth: Path, scores: Sequence[str]
         scores: names in ``heatsplat.metrics.definitions.DEFINITIONS``.
 
     Raises:
-        SceneError: views are missing, or a file is no image of temperatures in °C of the right size.
+        SceneError: views are missing or there twice, or a file is no image of temperatures in °C of the right size.
     """
     meta = json.loads((scene / META).read_text(encoding="utf-8"))
     bounds = ThermalRange(meta["min_value"], meta["max_value"])
@@ -103,7 +107,11 @@ def score_scene(handed_in: Path, scene: Path, truth: Path, scores: Sequence[str]
 
 
 def _file(folder: Path, name: str) -> Path | None:
-    return next((path for ending in ENDINGS if (path := folder / f"{name}{ending}").is_file()), None)
+    """The file of a view; None for none. Raises SceneError for several, of which one may be old."""
+    found = [path for ending in ENDINGS if (path := folder / f"{name}{ending}").is_file()]
+    if len(found) > 1:
+        raise SceneError(f"{found[0]} and {found[1].name} are of one view: delete the one that does not count")
+    return found[0] if found else None
 
 
 def checked(path: Path, shape: tuple[int, ...], bounds: ThermalRange) -> np.ndarray:
@@ -152,6 +160,7 @@ def read_submission(folder: Path) -> dict[str, Any]:
     if (
         not isinstance(told, dict)
         or not isinstance(told.get("method"), str)
+        or not (told["method"].strip() and told["method"].isprintable())  # it stands in lines of tables
         or not isinstance(told.get("scenes"), dict)
         or not told["scenes"]
     ):
@@ -193,6 +202,11 @@ def score_submission(folder: Path, root: Path, scores: Sequence[str]) -> tuple[d
     return told, found
 
 
+def scores_of(protocol: Mapping[str, Any]) -> list[str]:
+    """The scores of a protocol, the one that ranks first. Raises SceneError for none, and for one that renders do not tell."""
+    return subset_of("scores of the protocol", protocol["scores"], OF_RENDERS)
+
+
 def scenes_in(root: Path) -> list[str]:
     """Names of the scenes of a protocol's folder that have a truth. Raises SceneError where there are none."""
     names = sorted(
@@ -201,7 +215,7 @@ def scenes_in(root: Path) -> list[str]:
     if not names:
         raise SceneError(
             f"{root} has no scenes/ and truth/ of the protocol; write them: python src/study.py study=scenes "
-            f"study.target={root}"
+            f"{typed(setting('study.target', root))}"
         )
     return names
 
@@ -223,7 +237,7 @@ def run(
         raise SceneError(
             "give the folder of renders and that of the protocol's scenes: submission=FOLDER root=FOLDER (docs/protocol.md)"
         )
-    output_dir, scores = Path(output_dir), list(protocol["scores"])
+    output_dir, scores = Path(output_dir), scores_of(protocol)
     folder, root = Path(submission).expanduser(), Path(root).expanduser()
     if (track := read_submission(folder).get("track")) not in (None, *protocol["tracks"]):
         raise SceneError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,14 +15,23 @@ from heatsplat.io.recorded import OVERRIDES
 from heatsplat.io.tables import NONE, markdown_table, over_seeds, write_csv
 from heatsplat.metrics.definitions import described, unit_of
 from heatsplat.studies.child_runs import all_rows
-from heatsplat.studies.finished import Runs, read_runs, row_names, settings_of
-
-log = logging.getLogger(__name__)
+from heatsplat.studies.finished import (
+    COLUMNS,
+    Runs,
+    clocks,
+    each_seed_once,
+    ran_on,
+    read_runs,
+    row_names,
+    settings_of,
+    versions,
+)
 
 TABLE_FILE, CSV_FILE, PICTURE_FILE = "table.md", "table.csv", "table.png"
 # Scores and costs in the table, where any job has them; between them stand the scores of own callbacks.
 SCORES = ("psnr", "ssim", "lpips", "mae_c", "clean_psnr", "clean_mae_c", "rgb_psnr")
 COSTS = ("train_seconds", "peak_memory_mb", "gaussians", "render_fps")
+DRAWN = 30  # scenes at most in the picture: two hundred take minutes, and few programs show a picture as long
 OWN_DIGITS = 4  # significant ones of the largest value of an own score
 
 Printed = Mapping[str, Mapping[str, str]]  # name of a row -> score or cost -> what a paper prints for it
@@ -63,14 +71,9 @@ def collect(folder: Path) -> list[Runs]:
     table = read_runs(sorted((path.parents[1] for path in folder.glob(f"*/{OVERRIDES}")), key=_number))
     if table.empty:
         return []
-    # A grid that got another seed numbers its jobs anew, and trains some of them again: each counts once.
-    jobs = [tuple(sorted(row.overrides.items())) or row.folder for row in table.itertuples()]
-    done_last = table.assign(job=jobs, done=table["failed"].isna()).sort_values("done", kind="stable")
-    kept = done_last.drop_duplicates("job", keep="last").index
-    if len(kept) < len(table):
-        log.warning("%s: %d jobs were trained more than once; each counts once", folder, len(table) - len(kept))
-        table = table.loc[table.index.isin(kept)].reset_index(drop=True)
     table[["name", "other"]] = row_names(table["overrides"], table["scene"])
+    # A grid that got another seed numbers its jobs anew, and trains some of them again.
+    table = each_seed_once(table, [*zip(table["scene"], table["name"], table["other"], strict=True)])
     groups = table.groupby(["scene", "name", "other"], sort=False)
     return [Runs(name, scene, own, other) for (scene, name, other), own in groups]
 
@@ -87,7 +90,7 @@ def _columns(rows: Sequence[Runs]) -> list[str]:
         for row in rows
         for found in row.table["results"].dropna()
         for name in found.test
-        if described(name) is None
+        if described(name) is None and name not in COLUMNS
     )
     return [name for name in (*SCORES, *own, *COSTS) if any(row.values(name) for row in rows)]
 
@@ -120,7 +123,7 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
             *([row.scene] if several else []),
             row.label,
             row.count,
-            *(over_seeds(row.values(name), digits) for name, (_, digits) in shown.items()),
+            *(_cell(row, name, digits) for name, (_, digits) in shown.items()),
             *(paper.get(row.name, {}).get(name, NONE) for name in printed),
         ]
         for row in rows
@@ -137,7 +140,16 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
         about += (
             " No two rows are of one scene, so their scores are not to be compared: a scene for all is data.scene=NAME."
         )
+    results = [one for row in rows for one in row.table["results"].dropna()]
+    about = " ".join(filter(None, [about, clocks(map(ran_on, results)), versions(results)]))
     return "\n".join([f"# Sweep on {scenes}", "", about, "", *lines, ""])
+
+
+def _cell(row: Runs, name: str, digits: int) -> str:
+    """Mean and spread over the seeds, and how many have the value where not all do."""
+    values = row.values(name)
+    few = f" ({len(values)} of {row.count})" if 0 < len(values) < row.count else ""
+    return over_seeds(values, digits) + few
 
 
 def _records(rows: Sequence[Runs], paper: Printed) -> list[dict[str, Any]]:
@@ -158,8 +170,11 @@ def picture(rows: Sequence[Runs]) -> Figure | None:
     shown = [name for name in ("psnr", "mae_c") if any(row.mean(name) is not None for row in rows)]
     if not shown or not any(row.mean("train_seconds") for row in rows):
         return None
-    scenes, labels = list(dict.fromkeys(row.scene for row in rows)), list(dict.fromkeys(row.label for row in rows))
+    every, labels = list(dict.fromkeys(row.scene for row in rows)), list(dict.fromkeys(row.label for row in rows))
+    scenes = every[:DRAWN]
     figure = Figure(figsize=(5.2 * len(shown), 4.2 * len(scenes)), dpi=110, layout="constrained")
+    if len(scenes) < len(every):
+        figure.suptitle(f"the first {len(scenes)} of {len(every)} scenes; the table has all")
     panels = figure.subplots(len(scenes), len(shown), squeeze=False)
     for line, scene in zip(panels, scenes, strict=True):
         for axes, name in zip(line, shown, strict=True):

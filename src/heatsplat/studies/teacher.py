@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from heatsplat.contracts import SceneError, check_count, check_numbers
 from heatsplat.geometry.resampling import resampled
+from heatsplat.io.command_lines import setting, typed
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import Panel, colorize, compose, write_png
 from heatsplat.io.tables import markdown_table
@@ -104,7 +105,7 @@ def run(
                 "",
                 *markdown_table(["enlarged by", "PSNR (dB)"], rows),
                 "",
-                f"Use it: `python src/train.py method=supirgs super_resolution={factor} teacher={file}`",
+                f"Use it: `python src/train.py method=supirgs super_resolution={factor} {typed(setting('teacher', file))}`",
                 "",
             ]
         ),

@@ -144,6 +144,7 @@ def run(
     seeds: Sequence[int] = (1, 2, 3),
     score: str = "psnr",
     overrides: Sequence[str] = (),
+    threads: int | None = None,
     train: str | None = None,
 ) -> list[Check]:
     """What became of each method; writes tune.md and tune.csv after every search and every comparison.
@@ -160,13 +161,15 @@ def run(
         seeds: of those comparisons; 0 is the search's.
         score: what makes a setting better: "psnr" or "mae_c", of the test views.
         overrides: of all runs.
+        threads: CPU threads of all runs; None: all cores.
         train: path of train.py; None: the installed heatsplat-train.
 
     Raises:
         SceneError: a case or an option is not as it should be, or a run with the default settings failed.
         ImportError: optuna is not installed.
     """
-    output_dir, overrides, seeds, check_steps = Path(output_dir), listed(overrides), listed(seeds), listed(check_steps)
+    output_dir, seeds, check_steps = Path(output_dir), listed(seeds), listed(check_steps)
+    overrides = [*([] if threads is None else [f"threads={threads}"]), *listed(overrides)]
     chosen = _checked(cases, listed(methods), trials, seeds, score)
     for key, steps in (("search_steps", [search_steps]), ("check_steps", check_steps)):
         for count in steps:

@@ -22,9 +22,13 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from heatsplat.io.command_lines import as_dict
+from heatsplat.io.files import write_atomically
+from heatsplat.io.recorded import CONFIG, OVERRIDES, config_of, overrides_of
 from heatsplat.io.results import FAILED, METRICS_FILE, RunResults
 
 log = logging.getLogger("heatsplat")
+
+MANY = 20  # jobs that take long enough to compose to say so
 
 
 class DiedError(RuntimeError):
@@ -40,12 +44,14 @@ class Job:
         overrides: what it sets.
         folder: where its results go.
         threads: CPU threads that it uses; None for all cores.
+        anew: whether results in its folder are of files of configuration that say other things now.
     """
 
     number: int
     overrides: tuple[str, ...]
     folder: Path
     threads: int | None
+    anew: bool = False
 
 
 class JobLauncher(Launcher):
@@ -66,6 +72,8 @@ class JobLauncher(Launcher):
         setup_globals()
         configure_log(self.config.hydra.hydra_logging, self.config.hydra.verbose)
         Path(self.config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
+        if len(job_overrides) >= MANY:
+            log.info("composing the settings of %d jobs, which name their folders", len(job_overrides))
         jobs = [self._job(initial_job_idx + i, overrides) for i, overrides in enumerate(job_overrides)]
         ended = {job.number: done for job in jobs if (done := _finished(job)) is not None}
         left = [job for job in jobs if job.number not in ended]
@@ -73,7 +81,10 @@ class JobLauncher(Launcher):
             log.info("#%d: %s", job.number, " ".join(filter_overrides(job.overrides)))
         if left:
             for job, outcome in zip(left, self.outcomes(left), strict=True):
-                ended[job.number] = outcome if isinstance(outcome, JobReturn) else _died(job, outcome)
+                if not isinstance(outcome, JobReturn):
+                    self.write_down(job)
+                    outcome = _died(job, outcome)
+                ended[job.number] = outcome
                 failed = ended[job.number].status == JobStatus.FAILED
                 log.info(
                     "#%d %s; %d of %d jobs ended", job.number, "FAILED" if failed else "done", len(ended), len(jobs)
@@ -82,6 +93,15 @@ class JobLauncher(Launcher):
 
     def _job(self, number: int, overrides: Sequence[str]) -> Job:
         return planned(self.hydra_context, self.config, number, overrides)
+
+    def write_down(self, job: Job) -> None:
+        """Writes what a job was to be, unless it came to that itself: the table of a sweep is of folders that say so."""
+        if (job.folder / OVERRIDES).exists():
+            return
+        with composed(self.hydra_context, self.config, job.number, job.overrides) as own:
+            config = OmegaConf.masked_copy(own, [key for key in own if key != "hydra"])
+            write_atomically(job.folder / CONFIG, OmegaConf.to_yaml(config))
+        write_atomically(job.folder / OVERRIDES, OmegaConf.to_yaml(filter_overrides(job.overrides)))
 
     def arguments(self, job: Job) -> tuple[Any, ...]:
         """The arguments with which ``execute`` runs the job in any process; cloudpickle can pickle them."""
@@ -92,7 +112,22 @@ def planned(context: HydraContext, config: DictConfig, number: int, overrides: S
     """A job of a sweep with its folder, which Hydra names by the job's own configuration."""
     with composed(context, config, number, overrides) as own:
         folder = Path(own.hydra.sweep.dir, own.hydra.sweep.subdir)
-        return Job(number, tuple(overrides), folder, OmegaConf.select(own, "threads"))
+        return Job(number, tuple(overrides), folder, OmegaConf.select(own, "threads"), _differs(own, folder))
+
+
+def _differs(config: DictConfig, folder: Path) -> bool:
+    """Whether a folder has results of other settings than are composed, which the command line need not tell: files may have
+    been edited since."""
+    if not (folder / METRICS_FILE).exists():
+        return False
+    from heatsplat.runs.resume import differences
+
+    try:
+        before = config_of(folder)
+    except (ValueError, OSError):  # the job says so itself
+        return True
+    own = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    return bool(before and differences(OmegaConf.to_container(own, resolve=False), before))
 
 
 @contextmanager
@@ -164,7 +199,6 @@ def _configuration(context: HydraContext, config: DictConfig, number: int, overr
 
 def _finished(job: Job) -> JobReturn | None:
     """What a job returned that has results of its settings already, else None."""
-    from heatsplat.io.recorded import overrides_of
     from heatsplat.runs.resume import learned_by
 
     file = job.folder / METRICS_FILE
@@ -175,7 +209,7 @@ def _finished(job: Job) -> JobReturn | None:
         before = overrides_of(job.folder)
     except (ValueError, OSError):  # the job says so itself, and takes no other down
         return None
-    if learned_by(before) != learned_by(as_dict(job.overrides)):
+    if job.anew or learned_by(before) != learned_by(as_dict(job.overrides)):
         return None  # the job compares what was composed, and refuses the results of other settings
     log.info("#%d has results already; skipped. Delete %s to run it again.", job.number, job.folder)
     done = JobReturn(overrides=job.overrides, status=JobStatus.COMPLETED)

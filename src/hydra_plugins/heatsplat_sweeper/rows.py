@@ -19,16 +19,14 @@ from hydra.types import HydraContext, RunMode, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
 from heatsplat.errors import SceneError
-from heatsplat.io.command_lines import keys_of
+from heatsplat.io.command_lines import keys_of, setting, typed
 from heatsplat.io.files import short_name
-from hydra_plugins.heatsplat_launchers._jobs import JobLauncher, composed, planned
+from hydra_plugins.heatsplat_launchers._jobs import MANY, JobLauncher, composed, planned
 
 if TYPE_CHECKING:
     from heatsplat.studies.sweep_plan import SweepPlan
 
 log = logging.getLogger("heatsplat")
-
-MANY = 20  # jobs that take long enough to compose to say so
 
 LONGEST = 120  # bytes; file systems allow 255, and row, scene and number come with them
 
@@ -137,9 +135,8 @@ class RowSweeper(BasicSweeper):
             return None if self.plan.idle else super().sweep(list(arguments))
         except BaseException:
             if any(folder.glob("*/.hydra")):  # without a job it is the command that is wrong
-                log.warning(
-                    "Not all jobs are done. To go on with those: the same command and hydra.sweep.dir=%s", folder
-                )
+                where = typed(setting("hydra.sweep.dir", folder))
+                log.warning("Not all jobs are done. To go on with those: the same command and %s", where)
             raise
         finally:
             for path in self.plan.write(folder):

@@ -13,8 +13,9 @@ from heatsplat.io.pictures import literal, series_look
 from heatsplat.io.tables import markdown_table, number
 from heatsplat.metrics.definitions import DEFINITIONS, described
 from heatsplat.studies.child_runs import all_rows
-from heatsplat.studies.finished import NAMES, SEEDS
+from heatsplat.studies.finished import NAMES, SEEDS, clocks, ran_on
 from heatsplat.studies.frontier.runs import SCORES, Recipe, dominated
+from heatsplat.studies.sweeps import DRAWN
 
 COLUMNS = ("train_seconds", "psnr", "ssim", "mae_c", "peak_memory_mb", "render_fps", "gaussians")
 LEGEND = (
@@ -91,7 +92,8 @@ def markdown(recipes: Sequence[Recipe], levels: Mapping[str, Sequence[float]]) -
     runs = [one for recipe in recipes for one in recipe.table.itertuples()]
     jobs = [{f"{key}={value}" for key, value in one.overrides.items() if key not in SEEDS | NAMES} for one in runs]
     found = {key: [one.results.run.get(key) for one in runs] for key in ("seed", "threads")}
-    lines = ["# Accuracy against training time", "", all_rows(sorted(set.intersection(*jobs)), **found), ""]
+    about = [all_rows(sorted(set.intersection(*jobs)), **found), clocks(ran_on(one.results) for one in runs)]
+    lines = ["# Accuracy against training time", "", " ".join(filter(None, about)), ""]
     for title, head, rows in tables(recipes, levels):
         lines += [f"## {title}", "", *markdown_table(head, rows, "l" + "r" * (len(head) - 1)), ""]
     return "\n".join([*lines, "![quality against seconds](frontier.svg)", "", LEGEND, ""])
@@ -121,9 +123,12 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
 
     A recipe looks the same in all panels.
     """
-    scenes = list(dict.fromkeys(recipe.scene for recipe in recipes))
+    every = list(dict.fromkeys(recipe.scene for recipe in recipes))
+    scenes = every[:DRAWN]
     places = {name: j for j, name in enumerate(sorted({recipe.name for recipe in recipes}))}
     figure = Figure(figsize=(11, 4.4 * len(scenes)), dpi=110, layout="constrained")
+    if len(scenes) < len(every):
+        figure.suptitle(f"the first {len(scenes)} of {len(every)} scenes; the tables have all")
     for i, scene in enumerate(scenes):
         own = [recipe for recipe in recipes if recipe.scene == scene]
         for k, name in enumerate(SCORES):

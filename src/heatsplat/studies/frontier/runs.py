@@ -17,7 +17,7 @@ from heatsplat.io.recorded import OVERRIDES
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE
 from heatsplat.io.tables import read_csv
 from heatsplat.metrics.definitions import DEFINITIONS
-from heatsplat.studies.finished import Runs, read_runs, settings_of, told_apart, unshared
+from heatsplat.studies.finished import Runs, each_seed_once, read_runs, settings_of, told_apart, unshared
 
 log = logging.getLogger("heatsplat")
 
@@ -119,10 +119,13 @@ def _courses(path: Path, clock: str) -> dict[str, list[tuple[float, float]]]:
 def group(runs: pd.DataFrame) -> list[Recipe]:
     """Runs by panel and recipe, with what lies on the front of its panel.
 
-    A panel is a scene whose runs measured alike views. Names leave out what all recipes share.
+    A panel is a scene whose runs measured alike views. Names leave out what all recipes share. Each seed of a recipe counts
+    once, the last run of it.
     """
     titles = panel_titles(runs)
-    panels = runs.assign(title=titles, name=_names(runs, titles)).groupby(["title", "name"], sort=False)
+    runs = runs.assign(title=titles, name=_names(runs, titles))
+    runs = each_seed_once(runs, [*zip(runs["title"], runs["name"], strict=True)])
+    panels = runs.groupby(["title", "name"], sort=False)
     recipes = [Recipe(name, title, own) for (title, name), own in panels]
     for scene in {recipe.scene for recipe in recipes}:
         of_scene = [recipe for recipe in recipes if recipe.scene == scene]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError, counted, is_number
-from heatsplat.io.files import write_atomically
+from heatsplat.io.files import short_name, write_atomically
 from heatsplat.io.page import write_page
 from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import CURVE_FILE, METRICS_FILE
@@ -27,6 +27,8 @@ from heatsplat.studies.frontier.runs import Recipe, find_runs, group
 from heatsplat.studies.options import listed, non_empty
 
 log = logging.getLogger("heatsplat")
+
+LONGEST = 200  # bytes of the name of a run's folder, of which file systems allow 255
 
 
 def run(
@@ -116,7 +118,9 @@ def asked_for(
         for scene, seed, *values in itertools.product(scenes, seeds, *grid.values()):
             settings = [f"{key}={spelled(value)}" for key, value in zip(grid, values, strict=True)]
             place = "_".join([method, scene, *(text.replace("/", "-") for text in settings), f"seed={seed}"])
-            jobs.append((place, [f"method={method}", f"data.scene={scene}", f"seed={seed}", *settings]))
+            jobs.append(
+                (short_name(place, LONGEST), [f"method={method}", f"data.scene={scene}", f"seed={seed}", *settings])
+            )
     return jobs
 
 

@@ -43,6 +43,13 @@ def page(found: Standings, board: Board, folder: Path | None) -> str:
     entries = found.entries
     beside = beside_reference(entries, board)
     scenes = list(dict.fromkeys(entry.scene for entry in entries))
+    # Those that ran on no scene with the reference, too.
+    told = {(entry.method, entry.track): (None, 0) for entry in entries if entry.seeds} | beside
+
+    def place(item: tuple[tuple[str, str], tuple[float | None, int]]) -> tuple[bool, float]:
+        value = item[1][0]
+        return value is None, (value or 0.0) * (-1 if board.higher else 1)
+
     content = {
         "score": board.score,
         "higher": board.higher,
@@ -64,9 +71,7 @@ def page(found: Standings, board: Board, folder: Path | None) -> str:
         "beside": [
             {"method": method, "track": track, "beside": value, "scenes": count,
              "cost": mean_costs([entry for entry in entries if (entry.method, entry.track) == (method, track)])}
-            for (method, track), (value, count) in sorted(
-                beside.items(), key=lambda item: item[1][0], reverse=board.higher
-            )
+            for (method, track), (value, count) in sorted(told.items(), key=place)
         ],
     }  # fmt: skip
     data = json.dumps(content, allow_nan=False, ensure_ascii=False).replace("</", "<\\/")
@@ -92,6 +97,7 @@ def _told(entry: Entry, board: Board, folder: Path | None) -> dict[str, Any]:
         "cost": {name: entry.cost(name) for name in ("seconds", "memory_mb", "gaussians", "steps")},
         "command": entry.command,
         "links": links,
+        "reason": entry.lost,
     }
 
 

@@ -8,19 +8,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_option
 from heatsplat.io.command_lines import setting
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.leaderboard.earlier import EarlierPage, read_page
-from heatsplat.studies.options import listed
-from heatsplat.studies.score import META, SCENES, SceneScore, scenes_in, score_submission
+from heatsplat.studies.options import listed, whole_numbers
+from heatsplat.studies.score import META, SCENES, SceneScore, scenes_in, score_submission, scores_of
 
 DECIDED = {
     "method": "methods",
     "data.scene": "scenes",
     "seed": "seeds",
 }  # key of a run -> what chooses among its values
+CLOCKS = ("train_seconds", "cpu_seconds")
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Submission:
         command: where the code is, in place of a command line.
         scores: scene -> its score.
         seed: of the run that made them; None where it is not told.
+        machine: that its seconds are of; empty where it is not told.
     """
 
     folder: Path
@@ -41,6 +43,7 @@ class Submission:
     command: str
     scores: Mapping[str, SceneScore]
     seed: int | None = None
+    machine: str = ""
 
 
 @dataclass(frozen=True)
@@ -125,7 +128,7 @@ class Board:
                 f"method={method}",
                 "data=benchmark",
                 setting("data.root", self.root),
-                f"data.scene={scene}",
+                setting("data.scene", scene),
                 f"seed={seed}",
                 *self.protocol["tracks"][track],
                 *own.get(method, ()),
@@ -162,7 +165,8 @@ def board_of(
 
     Raises:
         SceneError: no folder of scenes, names that there are not, a key that the board decides, or several values of another; a
-            submission is none, or has the name of a method or an unknown track; the page is not one of this board.
+            submission is none, or has the name of a method, an unknown track or the seed of another; the page is not one of this
+            board.
     """
     for key, instead in DECIDED.items():
         if key in given:
@@ -197,16 +201,25 @@ def board_of(
                 f"leaderboard.{key}: there is no {', '.join(unknown)}; there are {', '.join(choices[key])}"
             )
 
+    scores_of(protocol)
+    check_option("leaderboard.clock", asked["clock"], CLOCKS, SceneError)
+    seeds = whole_numbers("leaderboard.seeds", listed(asked["seeds"]) or protocol["seeds"], least=0)
+
     def path(text: str | None) -> Path | None:
         return None if text is None else Path(text).expanduser()
 
     board = Board(
-        protocol, root, **chosen, seeds=listed(asked["seeds"]) or protocol["seeds"], clock=asked["clock"],
+        protocol, root, **chosen, seeds=seeds, clock=asked["clock"],
         document=path(asked["document"]), page=path(asked["page"]), train=asked["train"], note=asked["note"],
     )  # fmt: skip
-    submissions = [_submission(Path(text).expanduser(), board, known) for text in listed(asked["submissions"])]
+    folders = {place.resolve(): place for place in map(path, listed(asked["submissions"]))}  # each once
+    submissions = [_submission(folder, board, known) for folder in folders.values()]
+    _check_seeds(submissions)
     earlier = path(asked["earlier"])
-    return replace(board, submissions=submissions, earlier=None if earlier is None else read_page(earlier, board))
+    page = None if earlier is None else read_page(earlier, board)
+    names = [*known, *(one.method for one in submissions), *(method for method, _, _ in (page.seeds if page else ()))]
+    check_option("the protocol's reference", protocol["reference"], dict.fromkeys(names), SceneError)
+    return replace(board, submissions=submissions, earlier=page)
 
 
 def _submission(folder: Path, board: Board, known: Collection[str]) -> Submission:
@@ -222,4 +235,18 @@ def _submission(folder: Path, board: Board, known: Collection[str]) -> Submissio
             f'{where}: "track" is {track}; this board has {", ".join(board.tracks)}. Name one of them there, or leave the '
             "folder out of leaderboard.submissions"
         )
-    return Submission(folder, method, track, str(told.get("code", "a submission")), scores, told.get("seed"))
+    words = {"command": str(told.get("code", "a submission")), "machine": str(told.get("machine") or "")}
+    return Submission(folder, method, track, scores=scores, seed=told.get("seed"), **words)
+
+
+def _check_seeds(submissions: Sequence[Submission]) -> None:
+    """Raises SceneError where two folders hand in the same seed of a scene, of which one alone would count."""
+    first: dict[tuple[str, str, str, int], Path] = {}
+    for one in submissions:
+        for scene in one.scores if one.seed is not None else ():
+            other = first.setdefault((one.method, one.track, scene, one.seed), one.folder)
+            if other != one.folder:
+                raise SceneError(
+                    f"{other} and {one.folder} both hand in seed {one.seed} of {one.method} on {scene}: give each run its own "
+                    f'"seed" in its {METRICS_FILE}, or leave one of them out'
+                )

@@ -79,6 +79,8 @@ def markdown(found: Standings, board: Board) -> str:
         lines += [f"### By held-out part, equal {track}", "", *_parts(own, board), ""]
         if reasons := _reasons(own):
             lines += ["### Methods that were not run", "", *(f"- {text}" for text in reasons), ""]
+        if lost := [f"- `{one.method}` on {one.scene}, {one.lost}" for one in own if one.lost]:
+            lines += ["### Seeds without a result", "", *lost, ""]
     lines += ["## Scores", "", *(f"- {name}: {DEFINITIONS[name].sentence}" for name in board.scores), ""]
     return "\n".join(lines)
 
@@ -170,17 +172,19 @@ def _short(entry: Entry) -> str:
 
 
 def _records(entries: Sequence[Entry], board: Board) -> list[Mapping[str, object]]:
-    """A row per run in full precision, and one for all seeds of an earlier page; one without scores for what has none."""
+    """A row per run in full precision, and one for all seeds of an earlier page; one without scores for what has none, and for
+    seeds that have none."""
     rows: list[Mapping[str, object]] = []
     for entry in entries:
         about = {"method": entry.method, "scene": entry.scene, "track": entry.track}
         if entry.earlier.numbers:
             rows.append({**about, **entry.earlier.scores, **entry.earlier.cost, "seeds": len(entry.earlier.numbers)})
-        elif not entry.runs:
-            rows.append({**about, "reason": entry.reason})
         for run in entry.runs:
             score = run.score
             values = {name: score.mean(name) for name in board.scores}
             by_part = {f"{name}_{part}": score.mean(name, part) for part in score.parts for name in board.scores}
-            rows.append({**about, **values, **by_part, **run.cost, "folder": os.path.basename(run.folder)})
+            where = {"seed": run.seed, "folder": os.path.basename(run.folder)}
+            rows.append({**about, **values, **by_part, **run.cost, **where})
+        if entry.lost or not entry.seeds:
+            rows.append({**about, "reason": entry.lost or entry.reason})
     return rows

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
 import re
 import statistics
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError
-from heatsplat.io.files import write_atomically
-from heatsplat.io.recorded import OVERRIDES, overrides_of
-from heatsplat.io.results import METRICS_FILE
-from heatsplat.studies.finished import reason_of
+from heatsplat.contracts import SceneError, counted
+from heatsplat.io.command_lines import as_dict
+from heatsplat.io.files import read_json_object, write_atomically
+from heatsplat.io.recorded import OVERRIDES, told_of
+from heatsplat.io.results import METRICS_FILE, RunResults
+from heatsplat.studies.finished import ran_on, reason_of
 from heatsplat.studies.leaderboard.earlier import EarlierSeeds, Place, add_earlier, sentence
 from heatsplat.studies.leaderboard.plan import Board
 from heatsplat.studies.score import COSTS, META, SCENES, TRUTH, SceneScore, score_scene
+
+log = logging.getLogger("heatsplat")
 
 SCORE_FILE, SUBMISSION = "score.json", "submission"
 WIDTH = 2.0  # standard errors of a difference below which two methods are tied
@@ -37,6 +42,7 @@ class Result:
         cost: seconds, memory_mb, gaussians and steps, where known.
         folder: where it lies.
         command: what it was run with.
+        on: the machine and threads that its seconds are of, where they are told.
     """
 
     seed: int
@@ -44,6 +50,7 @@ class Result:
     cost: Mapping[str, float]
     folder: Path
     command: str
+    on: str = ""
 
 
 @dataclass
@@ -55,6 +62,7 @@ class Entry:
         runs: those that have results, each of a seed of its own.
         earlier: what an earlier page says of other seeds, which counts beside the runs.
         reason: why there are none.
+        failed: seed -> why its run has no results.
         rank: best and worst rank that the seeds allow, in its scene and track; None without results.
     """
 
@@ -64,6 +72,7 @@ class Entry:
     runs: list[Result] = field(default_factory=list)
     earlier: EarlierSeeds = field(default_factory=EarlierSeeds)
     reason: str = "not run yet"
+    failed: dict[int, str] = field(default_factory=dict)
     rank: tuple[int, int] | None = None
 
     @property
@@ -80,6 +89,12 @@ class Entry:
     def seeds(self) -> int:
         """How many seeds have results."""
         return len(self.all_numbers)
+
+    @property
+    def lost(self) -> str:
+        """Why seeds beside those with results have none; empty where there are no such."""
+        lost = sorted((seed, why) for seed, why in self.failed.items() if seed not in self.all_numbers)
+        return "; ".join(f"seed {seed}: {why}" for seed, why in lost) if self.seeds else ""
 
     @property
     def parts(self) -> list[str]:
@@ -140,7 +155,7 @@ class Standings:
 
     Args:
         entries: in the order of its scenes and methods, submissions last; ranked within scene and track.
-        note: what was taken from an earlier page.
+        note: what was taken from an earlier page, and the machines that seconds are of.
     """
 
     entries: list[Entry]
@@ -152,14 +167,15 @@ def standings(folder: Path, board: Board) -> Standings:
     places = {(run.method, run.scene, run.track): run for run in _entries(board)}
     for path in sorted(folder.glob(f"*/{OVERRIDES}")):
         _add_run(places, path.parents[1], board)
-    for submission in board.submissions:
-        for scene, score in submission.scores.items():
+    for submission in sorted(board.submissions, key=lambda one: one.seed is None):  # others take what numbers are left
+        for scene, score in ((scene, submission.scores[scene]) for scene in board.scenes if scene in submission.scores):
             key = (submission.method, scene, submission.track)
             entry = places.setdefault(key, Entry(*key))
             taken = entry.all_numbers
             seed = next(n for n in count() if n not in taken) if submission.seed is None else submission.seed
             if seed not in taken:
-                entry.runs.append(Result(seed, score, score.cost, submission.folder, submission.command))
+                told = (score, score.cost, submission.folder, submission.command, submission.machine)
+                entry.runs.append(Result(seed, *told))
     note = ""
     if board.earlier is not None:
         for place, seeds in board.earlier.seeds.items():
@@ -167,6 +183,10 @@ def standings(folder: Path, board: Board) -> Standings:
                 places.setdefault(place, Entry(*place))
         note = sentence(add_earlier(places, board.earlier))
     entries = list(places.values())
+    machines = Counter(run.on for entry in entries for run in entry.runs if run.on)
+    if machines:
+        told = "; ".join(f"{machine} ({counted(runs, 'run')})" for machine, runs in sorted(machines.items()))
+        note = " ".join(filter(None, [note, f"Measured on {told}."]))
     for ranked, usual in _competitions(entries, board):
         means = [one.mean(board.score) for one in ranked]
         errors = [standard_error(one, board.score, usual) for one in ranked]
@@ -196,30 +216,49 @@ def _entries(board: Board) -> list[Entry]:
 
 def _add_run(places: Mapping[Place, Entry], folder: Path, board: Board) -> None:
     """Adds what is in the folder of a run to its entry; runs of what the board does not ask for, or of a seed that the entry
-    has, are passed over."""
-    overrides = overrides_of(folder)
-    key = (overrides.get("method", ""), overrides.get("data.scene", ""), overrides.get("leaderboard.track", ""))
-    entry = places.get(key)
-    seed = int(overrides.get("seed", 0))
-    if entry is None or seed not in board.seeds or seed in entry.all_numbers:
+    has, are passed over, those that cannot be read with a word."""
+    try:
+        told = told_of(folder)
+    except (ValueError, OSError) as error:
+        log.warning("%s. Delete the folder to run it again.", error)
         return
-    if not (folder / METRICS_FILE).exists():
-        entry.reason = re.sub(r"^[\w.]+Error: ", "", reason_of(folder))
+    overrides = as_dict(told)
+    scene = overrides.get("data.scene", "").strip("'")  # in quotes where Hydra would not take its name as it stands
+    key = (overrides.get("method", ""), scene, overrides.get("leaderboard.track", ""))
+    entry = places.get(key)
+    if entry is None:
+        return
+    seed = int(overrides.get("seed", 0))
+    if seed not in board.seeds or seed in entry.all_numbers:
         return
     try:
-        score = scored_once(folder, entry.scene, board)
-    except SceneError as error:
-        entry.reason = str(error)
-        return
-    results = json.loads((folder / METRICS_FILE).read_text(encoding="utf-8"))
-    cost = results["cost"]
-    told = {
-        "seconds": cost.get(board.clock),
-        "memory_mb": cost.get("peak_memory_mb"),
-        "gaussians": cost.get("gaussians"),
+        entry.runs.append(_result(folder, seed, told, entry, board))
+    except (ValueError, OSError) as error:
+        entry.failed[seed] = entry.reason = str(error)
+
+
+def _result(folder: Path, seed: int, told: Sequence[str], entry: Entry, board: Board) -> Result:
+    """What a run came to. Raises SceneError, ValueError or OSError where it counts for nothing, with the reason."""
+    if not (folder / METRICS_FILE).exists():
+        raise SceneError(re.sub(r"^[\w.]+Error: ", "", reason_of(folder)))
+    if lacking := [text for text in board.protocol["tracks"][entry.track] if text not in told]:
+        raise SceneError(
+            f"{folder.name} was trained without {' '.join(lacking)} of the track {entry.track}; give another hydra.sweep.dir, or "
+            "delete the folder to run it again"
+        )
+    try:
+        results = RunResults.read(folder / METRICS_FILE)
+    except ValueError as error:
+        raise SceneError(f"{error}. Delete the folder to run it again.") from error
+    score = scored_once(folder, entry.scene, board)
+    cost = {
+        "seconds": results.cost.get(board.clock),
+        "memory_mb": results.cost.get("peak_memory_mb"),
+        "gaussians": results.cost.get("gaussians"),
+        "steps": results.run.get("steps"),
     }
-    command = " ".join(f"{name}={value}" for name, value in overrides.items() if not _of_the_board(name))
-    entry.runs.append(Result(seed, score, {**told, "steps": results["run"].get("steps")}, folder, command))
+    command = " ".join(f"{name}={value}" for name, value in as_dict(told).items() if not _of_the_board(name))
+    return Result(seed, score, cost, folder, command, ran_on(results))
 
 
 def _of_the_board(name: str) -> bool:
@@ -232,10 +271,10 @@ def scored_once(folder: Path, scene: str, board: Board) -> SceneScore:
     anew since, or the scene with other settings (``meta.json``)."""
     path, metrics = folder / SCORE_FILE, folder / METRICS_FILE
     made = hashlib.sha256((board.root / SCENES / scene / META).read_bytes()).hexdigest()
-    if path.exists() and path.stat().st_mtime >= metrics.stat().st_mtime:
-        known = json.loads(path.read_text(encoding="utf-8"))
-        if known["scores"] == board.scores and known.get("scene", made) == made:
-            return SceneScore(known["views"])
+    known = read_json_object(path) or {}
+    is_new = path.exists() and path.stat().st_mtime >= metrics.stat().st_mtime
+    if is_new and known.get("scores") == board.scores and known.get("scene", made) == made:
+        return SceneScore(known["views"])
     score = score_scene(folder / SUBMISSION, board.root / SCENES / scene, board.root / TRUTH / scene, board.scores)
     write_atomically(path, json.dumps({"scores": board.scores, "scene": made, "views": score.views}))
     return score

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,6 +59,8 @@ class Source:
         )
         by_name = {_plain(path.name): path.name for path in folders}
         found = {key: next((by_name[name] for name in of if name in by_name), None) for key, of in names.items()}
+        whole = {path.name for path in folders}
+        found |= {key: str(name) for key, name in (told or {}).items() if str(name) in whole}  # before any likeness
         return {key: folder for key, folder in found.items() if folder}
 
     def scene_of(self, folder: str, told: Mapping[str, str] | None = None) -> str | None:
@@ -103,5 +105,5 @@ def source(key: str) -> Source:
 
 
 def _plain(name: str) -> str:
-    """A folder's name without case and punctuation."""
-    return re.sub(r"[^a-z0-9]", "", name.lower())
+    """A folder's name without case, punctuation and accents, in any script."""
+    return "".join(letter for letter in unicodedata.normalize("NFKD", name.casefold()) if letter.isalnum())

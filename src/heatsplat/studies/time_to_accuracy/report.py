@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from heatsplat.io.pictures import literal, series_look
 from heatsplat.io.tables import NONE, markdown_table, over_seeds
 from heatsplat.metrics.definitions import DEFINITIONS
+from heatsplat.studies.finished import clocks
 from heatsplat.studies.frontier.runs import SCORES
 from heatsplat.studies.time_to_accuracy.runs import Outcome, Panel
 
@@ -106,8 +107,9 @@ def markdown(panels: Sequence[Panel], clock: str) -> str:
     lines = [f"# Time to the reference's accuracy, {CLOCK_LABELS[clock]}", ""]
     for panel in panels:
         margins = " and ".join(f"{panel.margins[score]:g} {DEFINITIONS[score].unit}" for score in _scores(panel))
+        about = [f"As good as the reference: within {margins} of it.", clocks(one.on for one in panel.outcomes)]
         lines += [
-            f"## {panel.title}", "", f"As good as the reference: within {margins} of it.", "",
+            f"## {panel.title}", "", " ".join(filter(None, about)), "",
             "Ends of whole runs, test views:", "", *ends(panel), "",
             "Until the course over the validation views is as good as the reference's last validation:", "",
             *times(panel, "way"), "",

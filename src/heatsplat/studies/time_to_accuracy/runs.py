@@ -13,7 +13,7 @@ import pandas as pd
 
 from heatsplat.io.command_lines import as_dict, key_of
 from heatsplat.metrics.definitions import DEFINITIONS
-from heatsplat.studies.finished import PLACES, settings_of
+from heatsplat.studies.finished import PLACES, ran_on, settings_of
 from heatsplat.studies.frontier.runs import panel_titles, seconds_to
 from heatsplat.studies.options import listed
 
@@ -32,6 +32,7 @@ class Outcome:
         scores: psnr (dB) and mae_c (°C) of the test views.
         gaussians: at its end.
         course: score -> (seconds, value) of the validations in order.
+        on: machine and threads, where they are told.
     """
 
     recipe: str | None
@@ -41,6 +42,7 @@ class Outcome:
     scores: dict[str, float]
     gaussians: float
     course: dict[str, list[tuple[float, float]]]
+    on: str = ""
 
     @property
     def kind(self) -> tuple[str | None, int | None]:
@@ -93,7 +95,8 @@ class Panel:
         reference = self.references[one.seed]
         found: dict[str, float | None] = {
             "seconds": one.seconds, "gaussians": one.gaussians, **one.scores,
-            "time_ratio": one.seconds / reference.seconds, "gaussians_ratio": one.gaussians / reference.gaussians,
+            "time_ratio": one.seconds / reference.seconds,
+            "gaussians_ratio": _ratio(one.gaussians, reference.gaussians or None),  # fields have none
         }  # fmt: skip
         for score, value in one.scores.items():
             higher, course = DEFINITIONS[score].higher, reference.course[score]
@@ -131,8 +134,8 @@ class Panel:
         return None
 
 
-def _ratio(seconds: float | None, of: float | None) -> float | None:
-    return None if seconds is None or of is None else seconds / of
+def _ratio(value: float | None, of: float | None) -> float | None:
+    return None if value is None or of is None else value / of
 
 
 def _between(low: float, high: float, share: float) -> float:
@@ -149,6 +152,12 @@ def further_of(overrides: Mapping[str, str], cases: Iterable[Sequence[str]]) -> 
     own = {f"{key}={value}" for key, value in overrides.items()}
     case = max((case for case in cases if own.issuperset(case)), key=len, default=())
     return [text for text in case if key_of(text) not in {"method", *PLACES}]
+
+
+def _told(overrides: Mapping[str, str]) -> list[str]:
+    """Settings that make a recipe, and the experiment, which sets what no override tells."""
+    experiment = overrides.get("experiment")
+    return [*settings_of(overrides), *([] if experiment is None else [f"experiment={experiment}"])]
 
 
 def panels_of(
@@ -181,9 +190,9 @@ def panels_of(
     panels: dict[str, Panel] = {}
     of_title = runs.assign(title=panel_titles(runs.assign(scene=scenes))).groupby("title", sort=False)
     for title, own in of_title:
-        settings = [{*settings_of(one.overrides)} - {*common, *one.further} for one in own.itertuples()]
+        settings = [{*_told(one.overrides)} - {*common, *one.further} for one in own.itertuples()]
         shared = {text for text in set.intersection(*settings) if text.startswith("data.")}
-        panel, seen = Panel(title, margins), set()
+        panel, kept = Panel(title, margins), {}
         for one, told in zip(own.itertuples(), settings, strict=True):
             told = frozenset(told - shared)
             standard = frozenset(without_length(told)) == usual and told not in names
@@ -192,13 +201,11 @@ def panels_of(
             if outcome is None:
                 log.warning("%s is left out: it does not tell its %s, PSNR and Gaussians", one.folder, clock)
                 continue
-            if (key := (*outcome.kind, outcome.seed)) in seen:
-                log.warning("%s is left out: another run of its recipe and seed was read before", one.folder)
-                continue
-            seen.add(key)
-            panel.outcomes.append(outcome)
-            if standard and outcome.steps == length:
-                panel.references[outcome.seed] = outcome
+            if (key := (*outcome.kind, outcome.seed)) in kept:
+                log.warning("%s is left out: a later run of its recipe and seed counts, %s", kept[key][1], one.folder)
+            kept[key] = outcome, one.folder
+        panel.outcomes += (outcome for outcome, _ in kept.values())
+        panel.references |= {one.seed: one for one in panel.outcomes if one.recipe is None and one.steps == length}
         for lone in [one for one in panel.outcomes if one.seed not in panel.references]:
             log.warning(
                 "%s, %s, seed %s is left out: there is no reference with this seed",
@@ -219,4 +226,4 @@ def _outcome(one: Any, name: str | None, clock: str) -> Outcome | None:
     mae = results.test.get("mae_c")
     scores = {"psnr": psnr} if mae is None else {"psnr": psnr, "mae_c": mae}
     seed = str(results.run.get("seed", one.overrides.get("seed", "0")))
-    return Outcome(name, seed, int(results.run["steps"]), seconds, scores, count, one.course)
+    return Outcome(name, seed, int(results.run["steps"]), seconds, scores, count, one.course, ran_on(results))

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from heatsplat.contracts import SceneError, check_count, check_option
+from heatsplat.contracts import SceneError, check_count, check_numbers, check_option
 from heatsplat.io.command_lines import as_dict
 from heatsplat.io.files import write_atomically
 from heatsplat.io.pictures import figure_picture, write_png
@@ -43,6 +43,7 @@ def run(
     lengths: Sequence[int] = (),
     seeds: Sequence[int] = (0,),
     overrides: Sequence[str] = (),
+    threads: int | None = None,
     train: str | None = None,
     outputs: str = "outputs",
 ) -> list[Panel]:
@@ -64,18 +65,23 @@ def run(
         lengths: steps of shorter standard runs.
         seeds: of the runs that are trained.
         overrides: of the runs that are trained; finished runs count as theirs whether they have them or not.
+        threads: CPU threads of the runs that are trained; None: all cores.
         train: path of train.py; None: the installed heatsplat-train.
         outputs: where runs lie.
 
     Raises:
-        SceneError: the reference has no length, the clock is none, a length is no number of steps, there are cases and no
-            seed, a run of the study failed, or there is no finished reference.
+        SceneError: the reference has no length, the clock is none, a margin no number, a length is no number of steps, there are
+            cases and no seed, a run of the study failed, or there is no finished reference.
     """
-    output_dir, reference, overrides = Path(output_dir), listed(reference), listed(overrides)
+    output_dir, reference = Path(output_dir), listed(reference)
+    overrides = [*([] if threads is None else [f"threads={threads}"]), *listed(overrides)]
     recipes = {name: listed(given) for name, given in recipes.items() if given is not None}
     check_option("study.clock", clock, CLOCKS, SceneError)
-    if "max_steps" not in as_dict(reference):
-        raise SceneError(f"study.reference={reference}: give its length too, such as max_steps=30000")
+    margins = {"psnr": psnr_margin_db, "mae_c": mae_margin_c}
+    for key, margin in zip(("study.psnr_margin_db", "study.mae_margin_c"), margins.values(), strict=True):
+        check_numbers(key, margin, error=SceneError)
+    if not as_dict(reference).get("max_steps", "").isdecimal():
+        raise SceneError(f"study.reference={reference}: give its length too, a whole number, such as max_steps=30000")
     if runs is None:
         runs = [] if cases else outputs
     folders = [Path(text).expanduser() for text in listed(runs)]
@@ -87,7 +93,6 @@ def run(
         if _identity(as_dict(own), common) not in there:
             train_or_read(output_dir / "runs" / place, train, [*overrides, *own], output_dir)
             folders = [*folders, output_dir / "runs" / place]
-    margins = {"psnr": psnr_margin_db, "mae_c": mae_margin_c}
     panels = panels_of(find_runs(folders, clock), clock, reference, recipes, margins, common, (cases or {}).values())
     if not panels:
         raise SceneError(
