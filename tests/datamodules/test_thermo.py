@@ -197,6 +197,26 @@ def test_poses_may_come_from_colmap(tmp_path):
     assert scene.point_colors is not None and "weather" in scene.metadata
 
 
+@pytest.mark.parametrize("form", ["{}/{}.png", "{}/{}", "{1}.png", "{1}", "yard/{}/{}.tif"])
+def test_frames_in_meta_may_be_named_with_and_without_folders_and_endings(yard, form):
+    utc = {}
+
+    def move(values):
+        for frame in values["frames"]:
+            utc[form.format(*Path(frame["file_path"]).parts)] = {"utc": frame.pop("utc")}
+
+    before = loaded(yard)
+    for subset in ("train", "test"):
+        change(yard / f"transforms_{subset}.json", move)
+    change(yard / "meta.json", lambda values: values.update(frames=utc))
+    assert len(utc) == FRAMES and loaded(yard).test.times_s == before.test.times_s
+    change(yard / "meta.json", lambda values: values.update(frames={"other.png": {"utc": 0}}))
+    with pytest.raises(
+        SceneError, match="meta.json: 'frames' names none of the scene's frames: other.png is not among"
+    ):
+        loaded(yard)
+
+
 def test_ntr_takes_weather_classes_and_features_that_lie_beside_it(yard):
     """The same folder without UTC is an NTR scene whose frames count seconds."""
     times = dict(zip((f"{i:04d}" for i in range(FRAMES)), recording().times_s.tolist(), strict=True))
