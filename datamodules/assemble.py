@@ -325,7 +325,11 @@ def _in_order(frames: Sequence[RawFrame]) -> tuple[list[RawFrame], list[float] |
     if len(known) < len(frames):
         notes: dict[str, Any] = {"time": "none: only static methods apply"}
         if known:
-            notes["time"] = f"none: only {len(known)} of {len(frames)} frames have a time, so no time is used"
+            lacking = next(f.name for f in frames if f.time_s is None)
+            notes["time"] = (
+                f"none: {len(known)} of {len(frames)} frames have a time, {lacking} has not, so none is used"
+            )
+            log.warning("times: %s", notes["time"])
         return sorted(frames, key=lambda f: f.name), None, notes
     frames = sorted(frames, key=lambda f: (f.time_s, f.name))
     times = [float(f.time_s) for f in frames]

@@ -63,10 +63,11 @@ def test_without_times_there_are_none():
     assert scene.notes["time"].startswith("none")
 
 
-def test_times_of_some_frames_only_are_not_used():
+def test_times_of_some_frames_only_are_not_used(caplog):
     scene = scene_of([grey(i) for i in range(9)], times=[0.0, None, *range(2, 9)])
     assert set(scene.train.times_s) == {None}
-    assert "only 8 of 9 frames have a time" in scene.notes["time"]
+    assert "8 of 9 frames have a time, 001.png has not, so none is used" in scene.notes["time"]
+    assert scene.notes["time"] in caplog.text
 
 
 def test_duplicate_times_are_kept_and_noted(caplog):
