@@ -417,8 +417,9 @@ def _outside(stored: _Stored) -> np.ndarray:
 
 
 def _clipped_fraction(stored: Sequence[_Stored]) -> float:
-    """Share of all pixels that lie outside the bounds and are clipped to them."""
-    return sum(int(_outside(s).sum()) for s in stored) / sum(s.thermal.size for s in stored)
+    """Share of the pixels that count which lie outside the bounds and are clipped to them."""
+    count = sum(s.thermal.size if s.mask is None else int(s.mask.sum()) for s in stored)
+    return sum(int((_outside(s) if s.mask is None else _outside(s) & s.mask).sum()) for s in stored) / max(count, 1)
 
 
 def _check_bounds(name: str, train: Sequence[_Stored], counts: Counts, bounds: ThermalRange) -> None:

@@ -126,6 +126,17 @@ def test_a_few_hot_pixels_are_within_the_bounds_of_training_images(caplog):
     assert "cut off" not in caplog.text
 
 
+def test_what_masks_leave_out_is_not_cut_off():
+    """A sky far colder than all that counts, beyond the bounds that this sets."""
+    images = [20 + grey(i).astype(np.float32) / 10 for i in range(9)]
+    sky = np.zeros((HEIGHT, WIDTH), bool)
+    sky[: HEIGHT // 2] = True
+    for image in images:
+        image[sky] = -40.0
+    scene = scene_of(images, frames_of(images, read_mask=[lambda: ~sky] * 9))
+    assert scene.thermal_range.min_c > 15 and scene.notes["clipped_fraction"] == 0
+
+
 def test_dead_pixels_and_counts_of_absolute_zero_set_no_bounds_and_are_warned_of(caplog):
     rng = np.random.default_rng(0)
     images = [(rng.uniform(19000, 19500, (HEIGHT, WIDTH))).astype(np.uint16) for _ in range(9)]
