@@ -1,3 +1,5 @@
+import unicodedata
+
 import cv2
 import numpy as np
 import pytest
@@ -6,6 +8,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats.images import (
     ImageIndex,
     colour_levels,
@@ -111,6 +114,26 @@ def test_hidden_files_are_no_images(tmp_path):
         write_image(tmp_path / name, np.zeros((2, 2), np.uint8))
     (tmp_path / "._a.png").write_bytes(b"\0\x05\x16\x07")
     assert ImageIndex(tmp_path).names == ["a.png"] and ImageIndex(tmp_path / ".hidden").names == ["a.png"]
+
+
+def test_links_to_folders_are_followed_once(tmp_path):
+    write_image(tmp_path / "disk" / "flight" / "a.png", np.zeros((2, 2), np.uint8))
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    (scene / "thermal").symlink_to(tmp_path / "disk" / "flight")
+    (scene / "again").symlink_to(tmp_path / "disk" / "flight")
+    (tmp_path / "disk" / "flight" / "back").symlink_to(scene)
+    (tmp_path / "disk" / "flight" / "itself").symlink_to(tmp_path / "disk")
+    names = ImageIndex(scene).names
+    assert {"thermal/a.png", "again/a.png"} <= set(names) and len(names) < 8
+
+
+def test_names_with_umlauts_are_found_however_these_are_written(tmp_path):
+    one, two = (unicodedata.normalize(form, "Köln_1.png") for form in ("NFC", "NFD"))
+    write_image(tmp_path / "1.png", np.zeros((2, 2), np.uint8))
+    (tmp_path / "1.png").rename(tmp_path / two)
+    assert one != two and ImageIndex(tmp_path).find(one) == two
+    assert same_files([one], [two]) == {one: [two]}
 
 
 def test_names_are_found_up_to_case_and_extension(tmp_path):
