@@ -10,7 +10,7 @@ import numpy as np
 
 from heatsplat.contracts import Camera, SceneError
 from heatsplat.datamodules.formats.colmap_library import pycolmap
-from heatsplat.datamodules.formats.colmap_records import check_records
+from heatsplat.datamodules.formats.colmap_records import check_records, names_in_text
 from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
@@ -79,13 +79,16 @@ def read_model_of(folder: Path) -> SparseModel:
         key: lens_of(c.model.name, list(c.params), c.width, c.height, f"{folder}, camera {key}")
         for key, c in model.cameras.items()
     }
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    told = names_in_text(folder / "images.txt") if suffix == "txt" else {}
+    posed = [image for image in model.images.values() if image.has_pose]
+    named = sorted(((told.get(image.image_id, image.name), image) for image in posed), key=lambda one: one[0])
+    images = [image for _, image in named]
     if not images:
         raise SceneError(f"sparse model {folder} has no registered image; reconstruct the scene again")
     points = list(model.points3D.values())
     return SparseModel(
         folder=folder,
-        names=tuple(image.name for image in images),
+        names=tuple(name for name, _ in named),
         viewmats=tuple(pose_matrix(image) for image in images),
         lenses=tuple(lenses[image.camera_id] for image in images),
         points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),

@@ -51,6 +51,13 @@ def test_cameras_points_and_pixels_come_back(tmp_path, text, place):
     json.dumps(scene.notes)  # the report writes them
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_names_may_have_spaces(tmp_path, text):
+    files = names(9, "flight 2/frame {:03d} T.png")
+    write_colmap(tmp_path, files, text=text)
+    assert [frame.name for frame in loaded(tmp_path).test.frames] == [files[0], files[8]]
+
+
 def test_the_root_may_be_the_scene_and_relative(tmp_path, monkeypatch):
     write_colmap(tmp_path / "data" / "s", names(9))
     monkeypatch.chdir(tmp_path)
