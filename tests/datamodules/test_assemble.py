@@ -355,6 +355,17 @@ def test_visible_images_share_the_thermal_grid():
     assert scene.notes["rgb_resized"].startswith("9 visible")
 
 
+@pytest.mark.parametrize(
+    ("sides", "told"), [((WIDTH * 2, HEIGHT * 2), False), ((HEIGHT, WIDTH), True), ((48, 32), True)]
+)
+def test_visible_images_of_another_shape_are_told(caplog, sides, told):
+    rgb = np.zeros((sides[1], sides[0], 3), np.uint8)
+    frames = frames_of([grey(i) for i in range(9)], read_rgb=[lambda: rgb] * 9)
+    scene = scene_of(None, frames=frames)
+    assert ("9 visible images have another shape than the thermal ones" in caplog.text) is told
+    assert ("9 of which have another shape" in scene.notes["rgb_resized"]) is told
+
+
 def test_masks_must_fit_the_image():
     frames = frames_of([grey(i) for i in range(9)], read_mask=[lambda: np.ones((3, 4), bool)] * 9)
     with pytest.raises(SceneError, match=f"mask of 0...png is 4x3 but the image is {WIDTH}x{HEIGHT}"):
