@@ -138,10 +138,11 @@ class Nerfstudio(SceneDataModule):
             return self.split, {}
         if frames[0].subset:
             return SplitRule("json"), {"split_source": f"train and test lists in {transforms.path.name}"}
-        words = (*TRAIN_WORDS, *TEST_WORDS)
-        if any(word in PurePosixPath(f.name).stem.lower() for f in frames for word in words):
+        stems = [PurePosixPath(f.name).stem.lower() for f in frames]
+        said = {tuple(any(word in stem for word in words) for words in (TRAIN_WORDS, TEST_WORDS)) for stem in stems}
+        if len(said) > 1:  # what all names say, as valley_001 and terrain_001 do, tells none apart
             return self.split, {}
-        says = f"every 8th frame is test: neither names nor {transforms.path.name} speak of train and test"
+        says = f"every 8th frame is test: neither names nor {transforms.path.name} tell train and test apart"
         return SplitRule("every_8th"), {"split_assumed": says}
 
     def _frames(
@@ -241,10 +242,13 @@ class Nerfstudio(SceneDataModule):
                 points = model.points @ turn[:3, :3].T + turn[:3, 3]
                 return points, model.colors, {"points_source": f"{place} (COLMAP), applied_transform"}
             rejected = f"; the model in {model.folder} is not used: its cameras lie up to {apart:.3g} units elsewhere"
-        ply = transforms.values.get("ply_file_path")
-        if ply and (transforms.path.parent / str(ply)).is_file():
-            points, colors = ply_points(transforms.path.parent / str(ply))
-            return points, colors, {"points_source": f"{ply}{rejected}"}
+        if ply := str(transforms.values.get("ply_file_path") or "").replace("\\", "/"):
+            path = transforms.path.parent / ply
+            if path.is_file():
+                points, colors = ply_points(path)
+                return points, colors, {"points_source": f"{ply}{rejected}"}
+            rejected += f"; ply_file_path of {transforms.path.name} is {ply}, which is not there"
+            log.warning("scene %s begins with random points%s", folder.name, rejected)
         points = random_points([f.viewmat for f in frames], self.random_points, self.seed)
         return points, None, told_random(len(points), rejected)
 

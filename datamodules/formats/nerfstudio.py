@@ -138,6 +138,9 @@ def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tu
         SceneError: no focal length, a camera model that is not supported, or distortion that the model does not have.
     """
     values = {**transforms.values, **frame}
+    for axis in "xy":  # a frame's own field of view goes before the file's focal length
+        if f"camera_angle_{axis}" in frame and f"fl_{axis}" not in frame:
+            values.pop(f"fl_{axis}", None)
     said = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")).upper()
     model = _COLMAP_NAME.get(said, said)
     source = f"{transforms.path}, {frame['file_path']}"

@@ -2,16 +2,18 @@
 
 import json
 import logging
+import math
 import shutil
 
 import numpy as np
 import pytest
 import torch
 from layouts import FOCAL, HEIGHT, WIDTH, grey, names, opengl, viewmats, write_colmap, write_image, write_json
+from plyfile import PlyData, PlyElement
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
-from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in
+from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in, read_transforms
 from heatsplat.datamodules.nerfstudio import Nerfstudio
 
 LENS = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 20.0, "cy": 16.0, "w": WIDTH, "h": HEIGHT}
@@ -133,6 +135,47 @@ def test_fields_of_view_tell_both_focal_lengths(tmp_path):
         write_json(tmp_path / "transforms.json", {**given, "frames": values["frames"]})
         K = loaded(tmp_path).train[0].camera.K
         assert [float(K[0, 0]), float(K[1, 1])] == pytest.approx([fx, fy]), given
+
+
+@pytest.mark.parametrize(
+    ("of_file", "of_frame", "found"),
+    [
+        ({"fl_x": 30, "fl_y": 32}, {}, (30, 32)),
+        ({"fl_x": 30}, {"camera_angle_x": 2 * math.atan(0.4)}, (WIDTH / 0.8, WIDTH / 0.8)),
+        ({"fl_x": 30, "fl_y": 32}, {"camera_angle_y": 2 * math.atan(0.4)}, (30, HEIGHT / 0.8)),
+        ({"camera_angle_x": 1, "camera_angle_y": 1}, {"fl_x": 50, "fl_y": 52}, (50, 52)),
+    ],
+)
+def test_a_frame_s_own_field_of_view_goes_before_the_focal_length_of_the_file(tmp_path, of_file, of_frame, found):
+    write_json(tmp_path / "t.json", {**of_file, "frames": [{"file_path": "a.png", "transform_matrix": [], **of_frame}]})
+    transforms = read_transforms(tmp_path / "t.json")
+    lens = lens_in(transforms, transforms.frames[0], lambda: (WIDTH, HEIGHT))
+    assert (lens.fx, lens.fy) == pytest.approx(found)
+
+
+@pytest.mark.parametrize("form", ["valley_{:03d}.png", "terrain_{:03d}.png", "latest_train_{:03d}.png", "f_{:03d}.png"])
+def test_words_that_all_names_have_split_nothing(tmp_path, form):
+    frames = [{"file_path": f"thermal/{form.format(i)}"} for i in range(9)]
+    for i, frame in enumerate(frames):
+        write_image(tmp_path / frame["file_path"], grey(i))
+    write_frames(tmp_path, frames)
+    scene = loaded(tmp_path)
+    assert [f.name for f in scene.test.frames] == [form.format(0), form.format(8)]
+    assert "tell train and test apart" in scene.notes["split_assumed"]
+
+
+@pytest.mark.parametrize(("said", "found"), [("some\\cloud.ply", True), ("cloud.ply", False)])
+def test_the_point_cloud_that_the_file_names_is_found_or_missed(tmp_path, caplog, said, found):
+    frames = [{"file_path": f"thermal/{i}.png"} for i in range(9)]
+    for i, frame in enumerate(frames):
+        write_image(tmp_path / frame["file_path"], grey(i))
+    write_frames(tmp_path, frames, ply_file_path=said)
+    rows = np.array([(i, i % 3, i % 2) for i in range(30)], dtype=[(axis, "f4") for axis in "xyz"])
+    (tmp_path / "some").mkdir()
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "some" / "cloud.ply"))
+    scene = loaded(tmp_path)
+    assert (len(scene.points) == 30) is found and ("points_random" in scene.notes) is not found
+    assert ("ply_file_path of transforms.json is cloud.ply, which is not there" in caplog.text) is not found
 
 
 def test_paths_of_windows_are_paths(tmp_path):
