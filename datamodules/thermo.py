@@ -95,7 +95,11 @@ class Thermo(OutdoorDataModule):
             thermal_range=range_in(path, bounds["min_value"], bounds["max_value"])[0],
             ambient_c=ambient_c,
             metres_per_unit=metres,
-            notes={"layout": "our convention for Thermo, which is not published", **notes},
+            notes={
+                "layout": "our convention for Thermo, which is not published",
+                "bounds_source": f"{META_FILE}, or data.min_c and data.max_c",
+                **notes,
+            },
             **scene,
             **surroundings,
         )

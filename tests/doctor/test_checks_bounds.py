@@ -41,6 +41,13 @@ def test_the_remedy_for_another_unit_is_one_that_such_files_have():
         assert helps in remedy and ("data." in remedy) == (posed and stored in ("counts", "grey8"))
 
 
+def test_the_remedy_names_what_gave_the_bounds():
+    of_rhd = replace(clean(), stored="grey8", bounds_in="info.json")
+    wrong = (replace(of_rhd, clipped=0.05), replace(of_rhd, bounds_c=(295.0, 329.0), unit_k=34.0))
+    for found in (findings_of(material, "bounds")[0] for material in wrong):
+        assert "(info.json)" in found.remedy and "data.bounds_c" not in found.remedy
+
+
 def test_greys_that_are_kelvin_x_100_are_found():
     def greys(low: float, high: float, stored: str = "grey16") -> list[str]:
         """What is found of 16-bit greys between two counts."""
