@@ -181,6 +181,11 @@ class Material:
         """Name of a frame of ``images``."""
         return self.names[self.chosen[frame]]
 
+    @property
+    def grid(self) -> str:
+        """Width and height of the images, which need not be those of the files (data.downscale)."""
+        return "x".join(map(str, self.images.shape[:0:-1]))
+
     def size(self, value: float) -> str:
         """A difference of values in words."""
         return f"{100 * value:.2g} % of the range" if self.unit_k is None else f"{value * self.unit_k:.2g} K"
