@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -186,7 +186,7 @@ class Nerfstudio(SceneDataModule):
                     lens=lens_in(entry.transforms, entry.frame, lambda read=read: read().shape[1::-1]),
                     read=None if photos else read,
                     read_rgb=partial(read_image, folder / rgb_file) if rgb_file else None,
-                    read_mask=self.mask_reader(masks, name),
+                    read_mask=self._named_mask(folder, index, entry) or self.mask_reader(masks, name),
                     subset=entry.subset or in_list,
                 )
             )
@@ -201,6 +201,20 @@ class Nerfstudio(SceneDataModule):
             notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
         times, notes["time_source"] = self._times(folder, written, [*listed][0])
         return [replace(f, time_s=times[f.name]) for f in frames] if times else frames, notes
+
+    def _named_mask(self, folder: Path, index: ImageIndex, entry: Entry) -> Callable[[], np.ndarray] | None:
+        """Reads the mask that a frame names under mask_path. Raises SceneError where there is none of that name."""
+        named = str(entry.frame.get("mask_path") or "").replace("\\", "/")
+        if not named:
+            return None
+        place = PurePosixPath(entry.transforms.path.parent.relative_to(folder).as_posix())
+        found = self.mask_reader(index, str(place / named))
+        if found is None:
+            raise SceneError(
+                f"{entry.transforms.path}: mask_path of {entry.frame['file_path']} is {named}, which is not there; put the mask "
+                "there, or take mask_path out"
+            )
+        return found
 
     def _times(
         self, folder: Path, written: Mapping[str, float | None], transforms: Transforms

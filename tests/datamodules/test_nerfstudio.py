@@ -178,6 +178,27 @@ def test_the_point_cloud_that_the_file_names_is_found_or_missed(tmp_path, caplog
     assert ("ply_file_path of transforms.json is cloud.ply, which is not there" in caplog.text) is not found
 
 
+def test_a_frame_s_own_mask_goes_before_that_of_its_name(tmp_path):
+    own, of_name = np.zeros((2, HEIGHT, WIDTH), np.uint8)
+    own[:, 3:], of_name[:, 9:] = 255, 255
+    frames = [{"file_path": f"thermal/{i}.png"} for i in range(9)]
+    for i, frame in enumerate(frames):
+        write_image(tmp_path / frame["file_path"], grey(i))
+    write_image(tmp_path / "masks" / "1.png", of_name)
+    write_image(tmp_path / "masks" / "2.png", of_name)
+    write_image(tmp_path / "masks" / "people.png", own)
+    frames[1]["mask_path"] = "masks\\people.png"
+    write_frames(tmp_path, frames)
+    masks = [view.mask for view in loaded(tmp_path).train]
+    assert (
+        masks[0].sum() == own.astype(bool).sum() and masks[1].sum() == of_name.astype(bool).sum() and masks[2] is None
+    )
+    frames[1]["mask_path"] = "masks/nobody.png"
+    write_frames(tmp_path, frames)
+    with pytest.raises(SceneError, match="mask_path of thermal/1.png is masks/nobody.png, which is not there"):
+        loaded(tmp_path)
+
+
 def test_paths_of_windows_are_paths(tmp_path):
     """colmap2nerf of instant-ngp writes the folder of the images as the system does."""
     for i in range(9):
