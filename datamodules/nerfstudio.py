@@ -148,7 +148,7 @@ class Nerfstudio(SceneDataModule):
     def _frames(
         self, folder: Path, listed: Mapping[Transforms, str | None], bounds: ThermalRange | None
     ) -> tuple[list[RawFrame], dict[str, Any]]:
-        index, masks = ImageIndex(folder), ImageIndex(folder / self.masks)
+        index, masks = ImageIndex(folder), self.mask_index(folder)
         entries = [
             Entry(transforms, subset, frame, *_files_of(frame, transforms.path.parent.relative_to(folder), index))
             for transforms, subset in listed.items()
@@ -196,6 +196,7 @@ class Nerfstudio(SceneDataModule):
                 f"none of the {len(entries)} frames of {next(iter(listed)).path} has a thermal image in {folder}: "
                 f"looked for {missing[0]} under thermal_file_path and in thermal/"
             )
+        self.warn_of_masks(masks, frames)
         notes |= told_missing(missing, len(entries), "a thermal image", folder)
         if self.rgb:
             notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"

@@ -135,7 +135,7 @@ def model_frames(
         describe: function from a name in the model to further fields of ``RawFrame``, such as time_s; a ``name`` among them
             replaces that of the model.
     """
-    masks = ImageIndex(scene / module.masks)
+    masks = module.mask_index(scene)
     frames = []
     for name, viewmat, lens in zip(model.names, model.viewmats, model.lenses, strict=True):
         file = files[name]
@@ -151,6 +151,7 @@ def model_frames(
                 **fields,
             )
         )
+    module.warn_of_masks(masks, frames)
     return frames
 
 
@@ -167,7 +168,7 @@ def listed_frames(
     Raises:
         SceneError: no frame has an image.
     """
-    index, masks = ImageIndex(folder), ImageIndex(folder / module.masks)
+    index, masks = ImageIndex(folder), module.mask_index(folder)
     frames: list[RawFrame] = []
     missing: list[str] = []
     for subset, file_name in FILES.items():
@@ -193,6 +194,7 @@ def listed_frames(
             )
     if not frames:
         raise SceneError(f"no frame of {folder / FILES['train']} has an image in {folder}: looked for {missing[0]}.png")
+    module.warn_of_masks(masks, frames)
     count = len(frames) + len(missing)
     notes = {"registered": count, "cameras": f"{' and '.join(FILES.values())}, OpenCV axes"}
     return frames, notes | told_missing(missing, count, "an image", folder)

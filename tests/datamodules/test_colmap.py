@@ -185,6 +185,27 @@ def test_masks_follow_colmap_s_rule(tmp_path, keep, suffix):
     assert scene.notes["masks"].startswith("4 of 9 images have a mask")
 
 
+def test_masks_that_are_not_used_are_told(tmp_path, caplog):
+    write_colmap(tmp_path, names(9))
+    for i in range(9):
+        write_image(tmp_path / "masks" / f"mask_{i:03d}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    assert loaded(tmp_path).train[0].mask is None
+    assert "masks: none of its 9 files is named after an image, such as frame_000.png.png, and no mask" in caplog.text
+    caplog.clear()
+    assert loaded(tmp_path, masks=None).train[0].mask is None and not caplog.text
+    with pytest.raises(SceneError, match="data.masks=mask: there is no folder .*/mask; data.masks=null uses no masks"):
+        loaded(tmp_path, masks="mask")
+
+
+def test_visible_images_of_other_names_are_refused(tmp_path):
+    write_colmap(tmp_path, names(9))
+    write_image(tmp_path / "rgb" / "photo_0.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    with pytest.raises(
+        SceneError, match=r"data.rgb=rgb: no file in .*like 'photo_0.png', and images like 'frame_000.png'"
+    ):
+        loaded(tmp_path, rgb="rgb")
+
+
 def test_visible_images_beside_the_thermal_ones(tmp_path):
     write_colmap(tmp_path, names(9))
     for i, name in enumerate(names(9)):
