@@ -167,6 +167,7 @@ class Nerfstudio(SceneDataModule):
             )
             if not photos:
                 entries = [replace(entry, thermal=entry.visible, visible=None) for entry in entries]
+        _check_thermal(entries)
         subsets = _listed_subsets([*listed], entries)
         mains = [entry.visible if photos else entry.thermal for entry in entries]
         plain_names = [PurePosixPath(main).name for main in mains if main is not None]
@@ -297,6 +298,18 @@ def bounds_of(folder: Path) -> tuple[ThermalRange | None, dict[str, Any]]:
     return bounds, {"bounds_source": path.name + (" (minimum and maximum were swapped)" if swapped else "")}
 
 
+def _check_thermal(entries: Sequence[Entry]) -> None:
+    """Raises SceneError where frames of different images have one thermal image: only one of the poses can be its own."""
+    named: dict[str, str] = {}
+    for entry in entries:
+        path = str(entry.frame["file_path"])
+        if entry.thermal and (other := named.setdefault(entry.thermal, path)) != path:
+            raise SceneError(
+                f"{entry.transforms.path}: the thermal image of both {other} and {path} would be {entry.thermal}; name that of "
+                "each thermal_file_path, or put them into folders of the same names in thermal/"
+            )
+
+
 def _listed_subsets(files: Sequence[Transforms], entries: Sequence[Entry]) -> list[str | None]:
     """Subset of each frame, from the lists that a transforms file may have (train_filenames, ...).
 
@@ -339,11 +352,13 @@ def _files_of(frame: Mapping[str, Any], place: Path, index: ImageIndex) -> tuple
     """
     path = PurePosixPath(place.as_posix()) / frame["file_path"]
     candidates = [PurePosixPath(place.as_posix()) / frame["thermal_file_path"]] if "thermal_file_path" in frame else []
-    candidates.append(PurePosixPath("thermal") / path.name)
+    # Folders of cameras or subsets may go on below: thermal/left/0001.png beside images/left/0001.png.
+    tails = [PurePosixPath(*path.parts[first:]) for first in range(len(path.parts))]
+    candidates += ["thermal" / tail for tail in tails]
     if set(path.parts[:-1]) & set(THERMAL_FOLDERS):
         candidates.append(path)
     thermal = next((file for c in candidates if (file := index.find(str(c)))), None)
     if place.parts and thermal:  # thermal/ has cameras of its own, which no visible image shares
         return thermal, None
-    places = (path, PurePosixPath("images") / path.name, PurePosixPath("rgb") / path.name)
+    places = (path, *(folder / tail for folder in ("images", "rgb") for tail in tails))
     return thermal, next((file for c in places if (file := index.find(str(c))) and file != thermal), None)

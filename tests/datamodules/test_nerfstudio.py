@@ -288,6 +288,30 @@ def two_cameras(folder, lists):
     return loaded(folder)
 
 
+@pytest.mark.parametrize("file", ["transforms.json", "transforms_{}.json"])
+def test_folders_may_go_on_in_that_of_thermal_images(tmp_path, file):
+    frames = {part: [{"file_path": f"./{part}/{i}.png"} for i in range(4)] for part in ("train", "test")}
+    for at, (part, listed) in enumerate(frames.items()):
+        for i, frame in enumerate(listed):
+            write_image(tmp_path / frame["file_path"], photo(4 * at + i))
+            write_image(tmp_path / "thermal" / frame["file_path"], grey(4 * at + i))
+        write_frames(tmp_path, listed if "{}" in file else [*frames["train"], *frames["test"]], file.format(part))
+    scene = loaded(tmp_path, split="folders")
+    assert [frame.name for frame in scene.test.frames] == [f"thermal/test/{i}.png" for i in range(4)]
+    assert np.allclose(scene.test[2].thermal[..., 0].numpy() * 255, grey(6), atol=0.5)
+    assert np.allclose(scene.test[2].rgb.numpy() * 255, photo(6), atol=0.5)
+
+
+def test_one_thermal_image_of_two_cameras_is_refused(tmp_path):
+    frames = [{"file_path": f"images/{camera}/{i}.png"} for camera in ("left", "right") for i in range(4)]
+    for i, frame in enumerate(frames):
+        write_image(tmp_path / frame["file_path"], photo(i))
+        write_image(tmp_path / "thermal" / f"{i % 4}.png", grey(i))
+    write_frames(tmp_path, frames)
+    with pytest.raises(SceneError, match="of both images/left/0.png and images/right/0.png would be thermal/0.png"):
+        loaded(tmp_path)
+
+
 def test_lists_tell_files_of_one_name_apart_by_their_folders(tmp_path):
     scene = two_cameras(tmp_path / "a", lambda files: {"train_filenames": files[:4], "test_filenames": files[4:]})
     assert [f.name for f in scene.test.frames] == [f"thermal/cam1/{i}.png" for i in range(4)]
