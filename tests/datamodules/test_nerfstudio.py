@@ -15,6 +15,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in, read_transforms
 from heatsplat.datamodules.nerfstudio import Nerfstudio
+from heatsplat.datamodules.points import ply_points
 
 LENS = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 20.0, "cy": 16.0, "w": WIDTH, "h": HEIGHT}
 
@@ -176,6 +177,15 @@ def test_the_point_cloud_that_the_file_names_is_found_or_missed(tmp_path, caplog
     scene = loaded(tmp_path)
     assert (len(scene.points) == 30) is found and ("points_random" in scene.notes) is not found
     assert ("ply_file_path of transforms.json is cloud.ply, which is not there" in caplog.text) is not found
+
+
+@pytest.mark.parametrize(("kind", "red"), [("u1", 204), ("f4", 204), ("f4", 0.8)])
+def test_colours_of_points_are_bytes_or_shares(tmp_path, kind, red):
+    rows = np.zeros(4, dtype=[(axis, "f4") for axis in "xyz"] + [(colour, kind) for colour in ("red", "green", "blue")])
+    rows["red"] = red
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "points.ply"))
+    _, colours = ply_points(tmp_path / "points.ply")
+    assert colours.max(axis=0).tolist() == pytest.approx([0.8, 0, 0])
 
 
 def test_a_frame_s_own_mask_goes_before_that_of_its_name(tmp_path):
