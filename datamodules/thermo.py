@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -73,10 +73,14 @@ class Thermo(OutdoorDataModule):
         path = folder / META_FILE
         meta = json_object(path)
         bounds = {k: celsius_in(meta, k, path) if own is None else own for k, own in self.bounds_c.items()}
-        frames, scene, notes = self._posed(folder, meta)
+        frames, scene, rows, notes = self._posed(folder, meta)
         if self.test_period is not None:
             frames = self._by_period(frames)
         surroundings = self.surroundings.read(folder, meta, frames)
+        tables = {key: surroundings[key] for key in ("labels", "point_features") if surroundings[key] is not None}
+        if tables and rows is not None:
+            order = rows()
+            surroundings |= {key: v[order] if len(v) == len(order) else v for key, v in tables.items()}
         if surroundings["weather"] is not None:  # one source for all frames
             frames = [replace(frame, environment=None) for frame in frames]
         ambient_c = meta.get("ambient_c") if self.ambient_c is None else self.ambient_c
@@ -106,20 +110,22 @@ class Thermo(OutdoorDataModule):
 
     def _posed(
         self, folder: Path, meta: Mapping[str, Any]
-    ) -> tuple[list[RawFrame], dict[str, np.ndarray | None], dict[str, Any]]:
-        """Frames, points with their colours, and notes, from the JSON files or the sparse model."""
+    ) -> tuple[list[RawFrame], dict[str, np.ndarray | None], Callable[[], np.ndarray] | None, dict[str, Any]]:
+        """Frames, points with their colours, what tells their rows in a file of another order, and notes, from the JSON files or
+        the sparse model."""
         if _has_transforms(folder):
             entries: list[Mapping[str, Any]] = []
             frames, notes = listed_frames(self, folder, lambda entry, _: entries.append(entry) or {})
             points, origin = mesh_points(folder, frames, self.random_points, self.seed)
-            return self._described(meta, frames, entries), {"points": points}, notes | origin
+            return self._described(meta, frames, entries), {"points": points}, None, notes | origin
         model = read_model(folder)
         index = image_index(folder, "images", "the folder of thermal images")
         files = {name: index.find(name) for name in model.names}
         _, notes = match_model(model, files, index, "images")
         frames = model_frames(self, folder, model, files, index.folder)
         scene = {"points": model.points, "point_colors": model.colors}
-        return self._described(meta, frames, [{}] * len(frames)), scene, {"cameras": "sparse/0", **notes}
+        notes = {"cameras": "sparse/0", **notes}
+        return self._described(meta, frames, [{}] * len(frames)), scene, model.rows, notes
 
     def _described(
         self, meta: Mapping[str, Any], frames: Sequence[RawFrame], entries: Sequence[Mapping[str, Any]]
