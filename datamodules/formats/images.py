@@ -81,7 +81,20 @@ def _only(path: Path) -> np.ndarray | None:
             f"image {path} is a TIFF of {count} images, and one is expected; write each into a file of its own, or prepare the "
             "file (src/prepare.py), which takes every one"
         )
+    _check_channels(path)
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def _check_channels(path: Path) -> None:
+    """Raises SceneError for a TIFF with channels that OpenCV does not decode, or of which it leaves the upper eight bits."""
+    channels = bits = None
+    with path.open("rb") as file, suppress(struct.error, ValueError, OverflowError):
+        *_, bits, channels, _ = next(_tiff_pages(file), (0, (None,) * 6))[1]
+    if channels not in (None, 1, 3, 4) and (channels, bits) != (2, 8):
+        raise SceneError(
+            f"image {path} has {channels} channels of more than 8 bits; supported are 1, 3 and 4: write the one with the "
+            "temperatures into a file of its own (gdal_translate -b 1 IN.tif OUT.tif)"
+        )
 
 
 def _one_of(path: Path, page: int) -> np.ndarray | None:

@@ -1,3 +1,4 @@
+import struct
 import unicodedata
 
 import cv2
@@ -107,6 +108,17 @@ def test_other_pixel_types_are_refused(tmp_path):
     assert cv2.imwrite(str(tmp_path / "a.tiff"), np.zeros((4, 4), np.int32))
     with pytest.raises(SceneError, match="pixels of type int32; supported are uint8, uint16 and float32"):
         read_image(tmp_path / "a.tiff")
+
+
+@pytest.mark.parametrize(("channels", "bits"), [(2, 16), (5, 16), (2, 32)])
+def test_channels_that_are_not_decoded_are_refused(tmp_path, channels, bits):
+    """Of grey with alpha in 16 bits OpenCV leaves the upper eight."""
+    path = tmp_path / "a.tif"
+    tags = {256: 4, 257: 2, 258: bits, 277: channels}  # width, height, bits and number of channels
+    entries = b"".join(struct.pack("<HHIHH", tag, 3, 1, value, 0) for tag, value in tags.items())
+    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4))
+    with pytest.raises(SceneError, match=f"has {channels} channels of more than 8 bits; supported are 1, 3 and 4"):
+        read_image(path)
 
 
 def test_hidden_files_are_no_images(tmp_path):
