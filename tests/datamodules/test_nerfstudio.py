@@ -154,6 +154,18 @@ def test_a_frame_s_own_field_of_view_goes_before_the_focal_length_of_the_file(tm
     assert (lens.fx, lens.fy) == pytest.approx(found)
 
 
+def test_a_principal_point_of_larger_images_needs_their_size(tmp_path):
+    values = {"fl_x": 76, "cx": 41, "cy": 30, "frames": [{"file_path": "a.png", "transform_matrix": []}]}
+    write_json(tmp_path / "t.json", values)
+    transforms = read_transforms(tmp_path / "t.json")
+    with pytest.raises(
+        SceneError, match=f"t.json, a.png: the principal point 41, 30 lies outside its image of {WIDTH}x{HEIGHT}"
+    ):
+        lens_in(transforms, transforms.frames[0], lambda: (WIDTH, HEIGHT))
+    lens = lens_in(transforms, {**transforms.frames[0], "w": 80, "h": 64}, lambda: (WIDTH, HEIGHT))
+    assert lens.resized(WIDTH, HEIGHT).fx == 38
+
+
 @pytest.mark.parametrize("form", ["valley_{:03d}.png", "terrain_{:03d}.png", "latest_train_{:03d}.png", "f_{:03d}.png"])
 def test_words_that_all_names_have_split_nothing(tmp_path, form):
     frames = [{"file_path": f"thermal/{form.format(i)}"} for i in range(9)]
