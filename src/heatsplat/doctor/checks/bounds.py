@@ -106,6 +106,9 @@ def _of_unit(material: Material, values: torch.Tensor) -> list[Finding]:
         kelvin = f"kelvin of {low - KELVIN_AT_0_C:.4g} .. {high - KELVIN_AT_0_C:.4g} °C"
         what = f"All pixels lie within {low:.4g} .. {high:.4g} °C, which may be {kelvin}."
         return [Finding("bounds", 0.9, what, remedy)]
+    if not given and material.stored == "celsius" and 0.0 <= low < high <= 1.0:
+        what = f"All pixels lie within {low:.3g} .. {high:.3g} °C, which may be shares of a range rather than temperatures."
+        return [Finding("bounds", 0.9, what, _shares_remedy(material))]
     if not given:  # a cold sky or a flame may be in view, but no scene consists of them
         low = high = _celsius(material, values.median()[None])[0]
     if low < EARTHLY_C[0] or high > EARTHLY_C[1]:
@@ -144,6 +147,14 @@ def _unit_remedy(material: Material) -> str:
         return "Check the unit: °C = counts.scale * number + counts.offset_c (-273.15 for kelvin)."
     bounds = material.bounds_in or (BOUNDS_IN if posed else "bounds_c or temperature_bounds.json")
     return f"Check the unit of the bounds ({bounds}): they are the °C of black and white."
+
+
+def _shares_remedy(material: Material) -> str:
+    """What makes temperatures of floats from 0 to 1."""
+    command = "counts.scale=SPAN counts.offset_c=MIN"
+    if material.cameras is not None:
+        command = f"python src/prepare.py source=IMAGES target=FOLDER {command} poses=given poses.model=SCENE"
+    return f"If they are: {command}, of the range that 0 and 1 stand for in °C."
 
 
 def _counts_as_greys(material: Material, values: torch.Tensor) -> list[Finding]:
