@@ -88,7 +88,8 @@ def read_model_of(folder: Path) -> SparseModel:
     }
     told = names_in_text(folder / "images.txt") if suffix == "txt" else {}
     posed = [image for image in model.images.values() if image.has_pose]
-    named = sorted(((told.get(image.image_id, image.name), image) for image in posed), key=lambda one: one[0])
+    names = [told.get(image.image_id, image.name).replace("\\", "/") for image in posed]  # as written on Windows
+    named = sorted(zip(names, posed, strict=True), key=lambda one: one[0])
     images = [image for _, image in named]
     if not images:
         raise SceneError(f"sparse model {folder} has no registered image; reconstruct the scene again")

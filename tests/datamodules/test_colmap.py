@@ -58,6 +58,14 @@ def test_names_may_have_spaces(tmp_path, text):
     assert [frame.name for frame in loaded(tmp_path).test.frames] == [files[0], files[8]]
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_names_may_have_folders_in_the_way_of_windows(tmp_path, text):
+    write_colmap(tmp_path, names(9, "left\\frame_{:03d}.png"), text=text, images=None)
+    for i, name in enumerate(names(9, "left/frame_{:03d}.png")):
+        write_image(tmp_path / "images" / name, grey(i))
+    assert [frame.name for frame in loaded(tmp_path).test.frames] == ["left/frame_000.png", "left/frame_008.png"]
+
+
 def test_the_root_may_be_the_scene_and_relative(tmp_path, monkeypatch):
     write_colmap(tmp_path / "data" / "s", names(9))
     monkeypatch.chdir(tmp_path)
