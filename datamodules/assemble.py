@@ -32,7 +32,7 @@ from heatsplat.contracts import (
 from heatsplat.datamodules.bounds import BOUNDS_FILE, MIN_CELSIUS, celsius
 from heatsplat.datamodules.formats.images import PSEUDO_COLOUR_LEVELS
 from heatsplat.datamodules.poses import MAX_COORDINATE
-from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, image_notes, prepare
+from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, check_masks, image_notes, prepare
 from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
 from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.splits import SplitRule
@@ -113,6 +113,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
         images = pool.map(partial(prepare, options=options), [frames[i] for i in used])
         prepared = dict(zip(used, images, strict=True))
     check_equals({frames[i].name: p for i, p in prepared.items()})
+    check_masks(prepared.values())
     raw = _with_temperatures(raw, [prepared[i] for i in train], notes)
     colour = {frames[i].name: p.colour for i, p in prepared.items() if p.colour > PSEUDO_COLOUR_LEVELS}
     raw = _with_pseudo_colour(raw, colour, options, notes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 # Share by which the sides of an image may differ in their scale from its camera's: those that COLMAP's undistorter trims
 # do by about a hundredth, 4:3 and 5:4 by 7 of them.
 MOST_SQUEEZED = 0.03
+MOST_MASKED = 0.9  # share of all pixels that masks leave out, from which they are rather the wrong way round
 
 
 @dataclass(frozen=True)
@@ -201,6 +202,21 @@ def check_equals(prepared: Mapping[str, PreparedImage]) -> None:
             f"({len(squeezed)} of {counted(len(prepared), 'image')} differ so); correct width and height of the camera (w and h "
             "in transforms.json, the cameras of a COLMAP model), or give images that are neither turned nor cropped"
         )
+
+
+def check_masks(prepared: Iterable[PreparedImage]) -> None:
+    """Warns where masks leave next to nothing of a scene, as those the wrong way round do. Raises SceneError where they leave
+    nothing."""
+    images = list(prepared)
+    count = sum(p.lens.width * p.lens.height for p in images)
+    left = count - sum(int((~p.mask).sum()) for p in images if p.mask is not None)
+    says = (
+        "data.mask_keep is white where white pixels count, black where they are left out; data.masks=null uses no masks"
+    )
+    if not left:
+        raise SceneError(f"masks or transparency leave out all pixels of all images; {says}")
+    if left < (1.0 - MOST_MASKED) * count:
+        log.warning("masks or transparency leave out %.4g %% of all pixels; %s", 100.0 * (1.0 - left / count), says)
 
 
 def image_notes(prepared: Mapping[int, PreparedImage], downscale: float) -> dict[str, Any]:

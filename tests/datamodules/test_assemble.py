@@ -366,6 +366,18 @@ def test_visible_images_of_another_shape_are_told(caplog, sides, told):
     assert ("9 of which have another shape" in scene.notes["rgb_resized"]) is told
 
 
+@pytest.mark.parametrize("image", [grey(0), grey(0).astype(np.float32)])
+def test_masks_that_are_the_wrong_way_round_are_told(caplog, image):
+    few, none = np.zeros((2, HEIGHT, WIDTH), bool)
+    few[3:6, 3:9] = True
+    scene_of(None, frames_of([image] * 9, read_mask=[lambda: ~few] * 9))
+    assert not caplog.text
+    scene_of(None, frames_of([image] * 9, read_mask=[lambda: few] * 9))
+    assert "masks or transparency leave out 98.59 % of all pixels; data.mask_keep is white where" in caplog.text
+    with pytest.raises(SceneError, match="leave out all pixels of all images; data.mask_keep"):
+        scene_of(None, frames_of([image] * 9, read_mask=[lambda: none] * 9))
+
+
 def test_masks_must_fit_the_image():
     frames = frames_of([grey(i) for i in range(9)], read_mask=[lambda: np.ones((3, 4), bool)] * 9)
     with pytest.raises(SceneError, match=f"mask of 0...png is 4x3 but the image is {WIDTH}x{HEIGHT}"):
