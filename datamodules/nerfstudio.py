@@ -149,8 +149,16 @@ class Nerfstudio(SceneDataModule):
         self, folder: Path, listed: Mapping[Transforms, str | None], bounds: ThermalRange | None
     ) -> tuple[list[RawFrame], dict[str, Any]]:
         index, masks = ImageIndex(folder), self.mask_index(folder)
+        apart = any((folder / "thermal").glob("transforms*.json"))  # thermal images have cameras of their own
+        if apart and (first := next(iter(listed))).path.parent == folder:
+            log.warning(
+                "scene %s: the cameras are those of %s; for those in thermal/ give data.root=%s data.scene=null",
+                *(folder.name, first.path.name, folder / "thermal"),
+            )
         entries = [
-            Entry(transforms, subset, frame, *_files_of(frame, transforms.path.parent.relative_to(folder), index))
+            Entry(
+                transforms, subset, frame, *_files_of(frame, transforms.path.parent.relative_to(folder), index, apart)
+            )
             for transforms, subset in listed.items()
             for frame in transforms.frames
         ]
@@ -345,15 +353,16 @@ def _listed_subsets(files: Sequence[Transforms], entries: Sequence[Entry]) -> li
     return subsets
 
 
-def _files_of(frame: Mapping[str, Any], place: Path, index: ImageIndex) -> tuple[str | None, str | None]:
+def _files_of(frame: Mapping[str, Any], place: Path, index: ImageIndex, apart: bool) -> tuple[str | None, str | None]:
     """Stored thermal and visible file of a frame of a JSON in ``place``, either may be None.
 
-    A file of which nothing says that it is thermal is a visible one here.
+    A file of which nothing says that it is thermal is a visible one here. Folders below thermal/ are those of photos, unless it
+    has cameras of its own (``apart``).
     """
     path = PurePosixPath(place.as_posix()) / frame["file_path"]
     candidates = [PurePosixPath(place.as_posix()) / frame["thermal_file_path"]] if "thermal_file_path" in frame else []
     # Folders of cameras or subsets may go on below: thermal/left/0001.png beside images/left/0001.png.
-    tails = [PurePosixPath(*path.parts[first:]) for first in range(len(path.parts))]
+    tails = [PurePosixPath(*path.parts[first:]) for first in range(len(path.parts))][-1 if apart else 0 :]
     candidates += ["thermal" / tail for tail in tails]
     if set(path.parts[:-1]) & set(THERMAL_FOLDERS):
         candidates.append(path)

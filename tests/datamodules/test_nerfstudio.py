@@ -283,6 +283,17 @@ def test_a_folder_thermal_with_cameras_of_its_own(tmp_path):
     assert view.rgb is None
 
 
+def test_cameras_of_photos_are_not_those_of_thermal_images_that_have_their_own(tmp_path, caplog):
+    for i, name in enumerate(names(9)):
+        write_image(tmp_path / "thermal" / "images" / name, grey(i))
+        write_image(tmp_path / "images" / name, photo(i))
+    for folder in (tmp_path, tmp_path / "thermal"):
+        write_frames(folder, [{"file_path": f"images/{name}"} for name in names(9)])
+    assert loaded(tmp_path).train[0].thermal is None
+    assert f"for those in thermal/ give data.root={tmp_path}/thermal data.scene=null" in caplog.text
+    assert loaded(tmp_path / "thermal").train[0].rgb is None
+
+
 def test_images_without_any_known_key_are_refused(tmp_path):
     write_frames(tmp_path, [{"picture": "a.png"}])
     with pytest.raises(SceneError, match="frame 0 has no key 'file_path'; it has picture, transform_matrix"):
