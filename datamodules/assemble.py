@@ -32,7 +32,7 @@ from heatsplat.contracts import (
 from heatsplat.datamodules.bounds import BOUNDS_FILE, MIN_CELSIUS, celsius
 from heatsplat.datamodules.formats.images import PSEUDO_COLOUR_LEVELS
 from heatsplat.datamodules.poses import MAX_COORDINATE
-from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, image_notes, prepare
+from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, check_masks, image_notes, prepare
 from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
 from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.splits import SplitRule
@@ -113,6 +113,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
         images = pool.map(partial(prepare, options=options), [frames[i] for i in used])
         prepared = dict(zip(used, images, strict=True))
     check_equals({frames[i].name: p for i, p in prepared.items()})
+    check_masks(prepared.values())
     raw = _with_temperatures(raw, [prepared[i] for i in train], notes)
     colour = {frames[i].name: p.colour for i, p in prepared.items() if p.colour > PSEUDO_COLOUR_LEVELS}
     raw = _with_pseudo_colour(raw, colour, options, notes)
@@ -325,7 +326,11 @@ def _in_order(frames: Sequence[RawFrame]) -> tuple[list[RawFrame], list[float] |
     if len(known) < len(frames):
         notes: dict[str, Any] = {"time": "none: only static methods apply"}
         if known:
-            notes["time"] = f"none: only {len(known)} of {len(frames)} frames have a time, so no time is used"
+            lacking = next(f.name for f in frames if f.time_s is None)
+            notes["time"] = (
+                f"none: {len(known)} of {len(frames)} frames have a time, {lacking} has not, so none is used"
+            )
+            log.warning("times: %s", notes["time"])
         return sorted(frames, key=lambda f: f.name), None, notes
     frames = sorted(frames, key=lambda f: (f.time_s, f.name))
     times = [float(f.time_s) for f in frames]
@@ -413,8 +418,9 @@ def _outside(stored: _Stored) -> np.ndarray:
 
 
 def _clipped_fraction(stored: Sequence[_Stored]) -> float:
-    """Share of all pixels that lie outside the bounds and are clipped to them."""
-    return sum(int(_outside(s).sum()) for s in stored) / sum(s.thermal.size for s in stored)
+    """Share of the pixels that count which lie outside the bounds and are clipped to them."""
+    count = sum(s.thermal.size if s.mask is None else int(s.mask.sum()) for s in stored)
+    return sum(int((_outside(s) if s.mask is None else _outside(s) & s.mask).sum()) for s in stored) / max(count, 1)
 
 
 def _check_bounds(name: str, train: Sequence[_Stored], counts: Counts, bounds: ThermalRange) -> None:

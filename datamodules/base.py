@@ -16,7 +16,7 @@ import numpy as np
 import pytorch_lightning as pl
 from torch.utils.data import DataLoader
 
-from heatsplat.contracts import SceneData, SceneError, check_option
+from heatsplat.contracts import SceneData, SceneError, check_option, counted
 from heatsplat.datamodules.assemble import build_scene
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, split_alpha, to_grey
 from heatsplat.datamodules.formats.lens import Lens
@@ -29,6 +29,7 @@ from heatsplat.training.sampler import StepSampler
 __all__ = ["CELSIUS", "Counts", "Lens", "RawFrame", "RawScene", "SceneDataModule", "SceneOptions", "build_scene"]
 
 REPORT_FILE = "report.html"  # of a preparation
+MASKS = "masks"
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +47,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         split_file: file of test names for ``list``, relative to the scene or the working directory.
         seed: of the order of views, and of random points where a scene has none.
         thermal_channels: 1, or 3 for pseudo-colour without temperatures.
-        masks: folder in the scene with a mask <image name>.png per image (COLMAP's rule); used where it exists.
+        masks: folder in the scene with a mask <image name>.png per image (COLMAP's rule), which need not be there; None for none.
         mask_keep: "white" when white pixels count (COLMAP), "black" when they are left out.
         alpha_mask: True to leave out transparent pixels.
         degrade, upsample: how training images lose resolution, and are enlarged again (``heatsplat.datamodules.lowres``).
@@ -69,7 +70,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         split_file: str | None = None,
         seed: int = 0,
         thermal_channels: int = 1,
-        masks: str = "masks",
+        masks: str | None = MASKS,
         mask_keep: str = "white",
         alpha_mask: bool = False,
         degrade: str | None = None,
@@ -165,10 +166,28 @@ class SceneDataModule(pl.LightningDataModule, ABC):
             raise SceneError(f"data.scene={self.scene_name}: {looked_for} is missing; {folder} holds {_listed(folder)}")
         return folder
 
-    def mask_reader(self, masks: ImageIndex, image_name: str) -> Callable[[], np.ndarray] | None:
+    def mask_index(self, scene: Path) -> ImageIndex | None:
+        """The masks in a scene's folder, None where none are to be used. Raises SceneError where a folder that was named is not
+        there."""
+        if not self.masks:
+            return None
+        folder = scene / self.masks
+        if self.masks != MASKS and not folder.is_dir():
+            raise SceneError(f"data.masks={self.masks}: there is no folder {folder}; data.masks=null uses no masks")
+        return ImageIndex(folder)
+
+    def mask_reader(self, masks: ImageIndex | None, image_name: str) -> Callable[[], np.ndarray] | None:
         """Reads the mask of an image as [H, W] bool, True where a pixel counts; None where there is no mask."""
-        file = masks.find(f"{image_name}.png") or masks.find(image_name)
+        file = None if masks is None else masks.find(f"{image_name}.png") or masks.find(image_name)
         return None if file is None else partial(_read_mask, masks.folder / file, self.mask_keep == "white")
+
+    def warn_of_masks(self, masks: ImageIndex | None, frames: Sequence[RawFrame]) -> None:
+        """Warns of masks that are not used, as none has the name of an image."""
+        if masks and masks.names and not any(frame.read_mask for frame in frames):
+            log.warning(
+                "%s: none of its %s is named after an image, such as %s.png, and no mask is used; there are names like %s",
+                *(masks.folder, counted(len(masks.names), "file"), frames[0].name, masks.names[0]),
+            )
 
     def finish(
         self, name: str, frames: Sequence[RawFrame], points: np.ndarray, split: SplitRule | None = None, **scene: Any

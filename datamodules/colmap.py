@@ -145,6 +145,11 @@ class Colmap(SceneDataModule):
         if masked := sum(f.read_mask is not None for f in frames):
             notes["masks"] = f"{masked} of {len(frames)} images have a mask in {self.masks}/ ({self.mask_keep} counts)"
         if rgb:
+            if not any(f.read_rgb for f in frames):
+                raise SceneError(
+                    f"data.rgb={self.rgb}: no file in {rgb.folder} has the name of an image: there are names like "
+                    f"{rgb.names[0]!r}, and images like {frames[0].name!r}"
+                )
             notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
         points, colors = model.points, model.colors
         if not len(points):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import PurePosixPath
@@ -24,7 +25,8 @@ def same_files(names: Sequence[str], listed: Iterable[str]) -> dict[str, list[st
     groups: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
     for at, all_of_them in enumerate((names, listed)):
         for name in dict.fromkeys(all_of_them):
-            groups[stem_of(name)][at].append(name)
+            # Letters and their marks are one character in names that were typed, and two in those of some disks of macOS.
+            groups[unicodedata.normalize("NFC", stem_of(name))][at].append(name)
     found: dict[str, list[str]] = {name: [] for name in names}
     for ours, theirs in groups.values():
         if not ours or not theirs:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, counted
 from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.side_files import found_file, read_table
 from heatsplat.datamodules.timestamps import (
@@ -16,6 +17,8 @@ from heatsplat.datamodules.timestamps import (
     times_from_csv,
     unrolled_midnight,
 )
+
+log = logging.getLogger(__name__)
 
 FRAMES_FILE = "frames.csv"  # of a prepared folder: file, time_s and more of each frame
 
@@ -67,15 +70,19 @@ class FrameTimes:
             return dict(zip(names, seconds, strict=True)), told
         if written is not None:
             return written, where
-        path = folder / FRAMES_FILE  # without times where a frame had none
+        path, told = folder / FRAMES_FILE, ""  # without times where a frame had none
         if path.is_file() and "time_s" in read_table(path).columns:
             times = _looked_up(times_from_csv(path, "file", "time_s"), names, path)
             if len(times) == len(names):
                 return times, path.name
+            lacking = next(name for name in names if name not in times)
+            told = f"{path.name} has those of {len(times)} of {counted(len(names), 'image')}, and none of {lacking}"
         of_names = {name: time for name in names if (time := dji_time(name)) is not None}
         if len(of_names) == len(names):
             return of_names, "DJI file names (whole seconds, the camera's clock)"
-        return None, "none (set data.time_regex or data.time_csv)"
+        if told:
+            log.warning("times are left out: %s; add a row for each image", told)
+        return None, f"none ({told or 'set data.time_regex or data.time_csv'})"
 
     def _table(self, folder: Path, names: Sequence[str]) -> tuple[Mapping[str, float], str]:
         path = found_file("data.time_csv", self.time_csv, folder)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -138,18 +138,27 @@ class Nerfstudio(SceneDataModule):
             return self.split, {}
         if frames[0].subset:
             return SplitRule("json"), {"split_source": f"train and test lists in {transforms.path.name}"}
-        words = (*TRAIN_WORDS, *TEST_WORDS)
-        if any(word in PurePosixPath(f.name).stem.lower() for f in frames for word in words):
+        stems = [PurePosixPath(f.name).stem.lower() for f in frames]
+        said = {tuple(any(word in stem for word in words) for words in (TRAIN_WORDS, TEST_WORDS)) for stem in stems}
+        if len(said) > 1:  # what all names say, as valley_001 and terrain_001 do, tells none apart
             return self.split, {}
-        says = f"every 8th frame is test: neither names nor {transforms.path.name} speak of train and test"
+        says = f"every 8th frame is test: neither names nor {transforms.path.name} tell train and test apart"
         return SplitRule("every_8th"), {"split_assumed": says}
 
     def _frames(
         self, folder: Path, listed: Mapping[Transforms, str | None], bounds: ThermalRange | None
     ) -> tuple[list[RawFrame], dict[str, Any]]:
-        index, masks = ImageIndex(folder), ImageIndex(folder / self.masks)
+        index, masks = ImageIndex(folder), self.mask_index(folder)
+        apart = any((folder / "thermal").glob("transforms*.json"))  # thermal images have cameras of their own
+        if apart and (first := next(iter(listed))).path.parent == folder:
+            log.warning(
+                "scene %s: the cameras are those of %s; for those in thermal/ give data.root=%s data.scene=null",
+                *(folder.name, first.path.name, folder / "thermal"),
+            )
         entries = [
-            Entry(transforms, subset, frame, *_files_of(frame, transforms.path.parent.relative_to(folder), index))
+            Entry(
+                transforms, subset, frame, *_files_of(frame, transforms.path.parent.relative_to(folder), index, apart)
+            )
             for transforms, subset in listed.items()
             for frame in transforms.frames
         ]
@@ -166,6 +175,7 @@ class Nerfstudio(SceneDataModule):
             )
             if not photos:
                 entries = [replace(entry, thermal=entry.visible, visible=None) for entry in entries]
+        _check_thermal(entries)
         subsets = _listed_subsets([*listed], entries)
         mains = [entry.visible if photos else entry.thermal for entry in entries]
         plain_names = [PurePosixPath(main).name for main in mains if main is not None]
@@ -185,7 +195,7 @@ class Nerfstudio(SceneDataModule):
                     lens=lens_in(entry.transforms, entry.frame, lambda read=read: read().shape[1::-1]),
                     read=None if photos else read,
                     read_rgb=partial(read_image, folder / rgb_file) if rgb_file else None,
-                    read_mask=self.mask_reader(masks, name),
+                    read_mask=self._named_mask(folder, index, entry) or self.mask_reader(masks, name),
                     subset=entry.subset or in_list,
                 )
             )
@@ -195,11 +205,26 @@ class Nerfstudio(SceneDataModule):
                 f"none of the {len(entries)} frames of {next(iter(listed)).path} has a thermal image in {folder}: "
                 f"looked for {missing[0]} under thermal_file_path and in thermal/"
             )
+        self.warn_of_masks(masks, frames)
         notes |= told_missing(missing, len(entries), "a thermal image", folder)
         if self.rgb:
             notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
         times, notes["time_source"] = self._times(folder, written, [*listed][0])
         return [replace(f, time_s=times[f.name]) for f in frames] if times else frames, notes
+
+    def _named_mask(self, folder: Path, index: ImageIndex, entry: Entry) -> Callable[[], np.ndarray] | None:
+        """Reads the mask that a frame names under mask_path. Raises SceneError where there is none of that name."""
+        named = str(entry.frame.get("mask_path") or "").replace("\\", "/")
+        if not named:
+            return None
+        place = PurePosixPath(entry.transforms.path.parent.relative_to(folder).as_posix())
+        found = self.mask_reader(index, str(place / named))
+        if found is None:
+            raise SceneError(
+                f"{entry.transforms.path}: mask_path of {entry.frame['file_path']} is {named}, which is not there; put the mask "
+                "there, or take mask_path out"
+            )
+        return found
 
     def _times(
         self, folder: Path, written: Mapping[str, float | None], transforms: Transforms
@@ -241,10 +266,13 @@ class Nerfstudio(SceneDataModule):
                 points = model.points @ turn[:3, :3].T + turn[:3, 3]
                 return points, model.colors, {"points_source": f"{place} (COLMAP), applied_transform"}
             rejected = f"; the model in {model.folder} is not used: its cameras lie up to {apart:.3g} units elsewhere"
-        ply = transforms.values.get("ply_file_path")
-        if ply and (transforms.path.parent / str(ply)).is_file():
-            points, colors = ply_points(transforms.path.parent / str(ply))
-            return points, colors, {"points_source": f"{ply}{rejected}"}
+        if ply := str(transforms.values.get("ply_file_path") or "").replace("\\", "/"):
+            path = transforms.path.parent / ply
+            if path.is_file():
+                points, colors = ply_points(path)
+                return points, colors, {"points_source": f"{ply}{rejected}"}
+            rejected += f"; ply_file_path of {transforms.path.name} is {ply}, which is not there"
+            log.warning("scene %s begins with random points%s", folder.name, rejected)
         points = random_points([f.viewmat for f in frames], self.random_points, self.seed)
         return points, None, told_random(len(points), rejected)
 
@@ -276,6 +304,18 @@ def bounds_of(folder: Path) -> tuple[ThermalRange | None, dict[str, Any]]:
         return None, {"bounds_source": f"none: there is no {BOUNDS_FILE}"}
     bounds, swapped = read_bounds(path, swap=True)
     return bounds, {"bounds_source": path.name + (" (minimum and maximum were swapped)" if swapped else "")}
+
+
+def _check_thermal(entries: Sequence[Entry]) -> None:
+    """Raises SceneError where frames of different images have one thermal image: only one of the poses can be its own."""
+    named: dict[str, str] = {}
+    for entry in entries:
+        path = str(entry.frame["file_path"])
+        if entry.thermal and (other := named.setdefault(entry.thermal, path)) != path:
+            raise SceneError(
+                f"{entry.transforms.path}: the thermal image of both {other} and {path} would be {entry.thermal}; name that of "
+                "each thermal_file_path, or put them into folders of the same names in thermal/"
+            )
 
 
 def _listed_subsets(files: Sequence[Transforms], entries: Sequence[Entry]) -> list[str | None]:
@@ -313,18 +353,21 @@ def _listed_subsets(files: Sequence[Transforms], entries: Sequence[Entry]) -> li
     return subsets
 
 
-def _files_of(frame: Mapping[str, Any], place: Path, index: ImageIndex) -> tuple[str | None, str | None]:
+def _files_of(frame: Mapping[str, Any], place: Path, index: ImageIndex, apart: bool) -> tuple[str | None, str | None]:
     """Stored thermal and visible file of a frame of a JSON in ``place``, either may be None.
 
-    A file of which nothing says that it is thermal is a visible one here.
+    A file of which nothing says that it is thermal is a visible one here. Folders below thermal/ are those of photos, unless it
+    has cameras of its own (``apart``).
     """
     path = PurePosixPath(place.as_posix()) / frame["file_path"]
     candidates = [PurePosixPath(place.as_posix()) / frame["thermal_file_path"]] if "thermal_file_path" in frame else []
-    candidates.append(PurePosixPath("thermal") / path.name)
+    # Folders of cameras or subsets may go on below: thermal/left/0001.png beside images/left/0001.png.
+    tails = [PurePosixPath(*path.parts[first:]) for first in range(len(path.parts))][-1 if apart else 0 :]
+    candidates += ["thermal" / tail for tail in tails]
     if set(path.parts[:-1]) & set(THERMAL_FOLDERS):
         candidates.append(path)
     thermal = next((file for c in candidates if (file := index.find(str(c)))), None)
     if place.parts and thermal:  # thermal/ has cameras of its own, which no visible image shares
         return thermal, None
-    places = (path, PurePosixPath("images") / path.name, PurePosixPath("rgb") / path.name)
+    places = (path, *(folder / tail for folder in ("images", "rgb") for tail in tails))
     return thermal, next((file for c in places if (file := index.find(str(c))) and file != thermal), None)

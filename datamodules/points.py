@@ -60,13 +60,16 @@ def obj_vertices(path: Path) -> np.ndarray:
 
 
 def ply_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points [P, 3] float64 and colours [P, 3] in [0, 1] (or None) of a .ply file. Raises SceneError when damaged."""
+    """Points [P, 3] float64 and colours [P, 3] in [0, 1] (or None) of a .ply file, which has them so or up to 255. Raises
+    SceneError when damaged."""
     try:
         vertex = PlyData.read(str(path))["vertex"]
         points = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64)
         colours = None
         if {"red", "green", "blue"} <= set(vertex.data.dtype.names):
-            colours = np.stack([vertex[c] for c in ("red", "green", "blue")], axis=1).astype(np.float64) / 255.0
+            colours = np.stack([vertex[c] for c in ("red", "green", "blue")], axis=1)
+            shares = colours.dtype.kind == "f" and colours.size and colours.max() <= 1.0
+            colours = colours.astype(np.float64) / (1.0 if shares else 255.0)
     except Exception as error:  # the reader has many of its own, and MemoryError for a count that is no count
         raise SceneError(f"{path} is no readable point cloud: {error}") from error
     if colours is not None and not ((colours >= 0) & (colours <= 1)).all():

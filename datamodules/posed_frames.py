@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -59,11 +60,26 @@ def match_model(
     notes: dict[str, Any] = {"registered": len(model.names), **_told_larger(model)}
     missing = [name for name in model.names if files[name] is None]
     notes |= told_missing(missing, len(model.names), f"a file in {folder}/", index.folder)
-    if unregistered := index.unused(f for f in files.values() if f):
+    used = [file for file in files.values() if file]
+    taken = {_numbered(file) for file in used}
+    unused = index.unused(used)
+    if beside := [file for file in unused if _numbered(file) in taken]:
+        notes["images_beside"] = (
+            f"{counted(len(beside), 'file')} of another camera beside those of the model, unused: {_some(beside)}"
+        )
+    if unregistered := [file for file in unused if _numbered(file) not in taken]:
         notes["images_unregistered"] = (
             f"{counted(len(unregistered), 'file')} not in the model, unused: {_some(unregistered)}"
         )
     return kept, notes
+
+
+def _numbered(file: str) -> str:
+    """A file's name up to its last digit, which a drone's files of one moment share: DJI_20240806173449_0008 of ..._0008_T.JPG
+    and ..._0008_V.JPG; as it is where it has no digits."""
+    path = PurePosixPath(file)
+    numbered = re.sub(r"\D+$", "", path.stem)
+    return (path.parent / numbered).as_posix() if numbered else file
 
 
 def _told_larger(model: SparseModel) -> dict[str, Any]:
@@ -119,7 +135,7 @@ def model_frames(
         describe: function from a name in the model to further fields of ``RawFrame``, such as time_s; a ``name`` among them
             replaces that of the model.
     """
-    masks = ImageIndex(scene / module.masks)
+    masks = module.mask_index(scene)
     frames = []
     for name, viewmat, lens in zip(model.names, model.viewmats, model.lenses, strict=True):
         file = files[name]
@@ -135,6 +151,7 @@ def model_frames(
                 **fields,
             )
         )
+    module.warn_of_masks(masks, frames)
     return frames
 
 
@@ -151,7 +168,7 @@ def listed_frames(
     Raises:
         SceneError: no frame has an image.
     """
-    index, masks = ImageIndex(folder), ImageIndex(folder / module.masks)
+    index, masks = ImageIndex(folder), module.mask_index(folder)
     frames: list[RawFrame] = []
     missing: list[str] = []
     for subset, file_name in FILES.items():
@@ -177,6 +194,7 @@ def listed_frames(
             )
     if not frames:
         raise SceneError(f"no frame of {folder / FILES['train']} has an image in {folder}: looked for {missing[0]}.png")
+    module.warn_of_masks(masks, frames)
     count = len(frames) + len(missing)
     notes = {"registered": count, "cameras": f"{' and '.join(FILES.values())}, OpenCV axes"}
     return frames, notes | told_missing(missing, count, "an image", folder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 # Share by which the sides of an image may differ in their scale from its camera's: those that COLMAP's undistorter trims
 # do by about a hundredth, 4:3 and 5:4 by 7 of them.
 MOST_SQUEEZED = 0.03
+MOST_MASKED = 0.9  # share of all pixels that masks leave out, from which they are rather the wrong way round
 
 
 @dataclass(frozen=True)
@@ -68,9 +69,10 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
         "model": frame.lens.model,
         "distorted": frame.lens.is_distorted,
         "camera": f"{frame.lens.width}x{frame.lens.height}",
-        "squeezed": _squeezed(width, height, frame.lens),
+        "squeezed": _squeezed(width, height, frame.lens.width, frame.lens.height),
         "nan": 0,
         "rgb_resized": False,
+        "rgb_squeezed": False,
     }
     mask = _both(alpha if options.alpha_mask else None, _mask_of(frame, width, height))
     keeps_colour = frame.read is None or options.thermal_channels == 3
@@ -85,6 +87,7 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
         rgb, _ = split_alpha(_supported(frame.read_rgb(), f"{frame.name} (visible)"))
         rgb = _three_channels(rgb, frame.name)
         found["rgb_resized"] = rgb.shape[:2] != (height, width)
+        found["rgb_squeezed"] = _squeezed(rgb.shape[1], rgb.shape[0], width, height) > MOST_SQUEEZED
         rgb = resized(rgb, width, height)
     lens = frame.lens.resized(width, height)
     if lens.is_distorted:
@@ -108,10 +111,10 @@ def _shrunk(side: float, multiple: int) -> int:
     return max(1, round(side / multiple)) * multiple
 
 
-def _squeezed(width: int, height: int, lens: Lens) -> float:
-    """By what share the two sides of an image differ in their scale from its camera's, beyond a pixel of each side that
-    rounding may take."""
-    differs = abs(math.log(width / lens.width * lens.height / height))
+def _squeezed(width: int, height: int, of_width: int, of_height: int) -> float:
+    """By what share the two sides of an image differ in their scale from those that they should have, beyond a pixel of each
+    side that rounding may take."""
+    differs = abs(math.log(width / of_width * of_height / height))
     return max(0.0, differs - 1.0 / width - 1.0 / height)
 
 
@@ -201,6 +204,21 @@ def check_equals(prepared: Mapping[str, PreparedImage]) -> None:
         )
 
 
+def check_masks(prepared: Iterable[PreparedImage]) -> None:
+    """Warns where masks leave next to nothing of a scene, as those the wrong way round do. Raises SceneError where they leave
+    nothing."""
+    images = list(prepared)
+    count = sum(p.lens.width * p.lens.height for p in images)
+    left = count - sum(int((~p.mask).sum()) for p in images if p.mask is not None)
+    says = (
+        "data.mask_keep is white where white pixels count, black where they are left out; data.masks=null uses no masks"
+    )
+    if not left:
+        raise SceneError(f"masks or transparency leave out all pixels of all images; {says}")
+    if left < (1.0 - MOST_MASKED) * count:
+        log.warning("masks or transparency leave out %.4g %% of all pixels; %s", 100.0 * (1.0 - left / count), says)
+
+
 def image_notes(prepared: Mapping[int, PreparedImage], downscale: float) -> dict[str, Any]:
     """What the images of a scene have in common and where they differ."""
     found = [p.found for p in prepared.values()]
@@ -237,6 +255,12 @@ def image_notes(prepared: Mapping[int, PreparedImage], downscale: float) -> dict
         log.warning("%s", notes["nan_pixels"])
     if rgb := sum(f["rgb_resized"] for f in found):
         notes["rgb_resized"] = f"{counted(rgb, 'visible image')} resized to the thermal grid"
+    if squeezed := sum(f["rgb_squeezed"] for f in found):
+        notes["rgb_resized"] += f", {squeezed} of which have another shape"
+        log.warning(
+            "%s have another shape than the thermal ones and are squeezed onto them: crop or rectify them to what the thermal "
+            "camera sees, or leave them out (data.rgb)", counted(squeezed, "visible image"),
+        )  # fmt: skip
     if masked := [p.mask for p in prepared.values() if p.mask is not None]:
         share = sum(int((~m).sum()) for m in masked) / sum(p.lens.width * p.lens.height for p in prepared.values())
         notes["masked_fraction"] = share

@@ -71,8 +71,8 @@ class RHD(SceneDataModule):
 
 
 def _digits(name: str) -> str | None:
-    """The nine digits of a file name, whatever stands before or after them."""
-    match = re.search(r"\d{9}", PurePosixPath(name).stem)
+    """The nine digits of a file name, whatever stands before or after them; of more in a row none says which are the time."""
+    match = re.search(r"(?<!\d)\d{9}(?!\d)", PurePosixPath(name).stem)
     return match[0] if match else None
 
 
@@ -96,7 +96,9 @@ def _times(files: list[str]) -> tuple[dict[str, float] | None, dict[str, Any]]:
     try:
         of_day = [seconds_of_day(_digits(file) or PurePosixPath(file).stem) for file in files]
     except ValueError as error:
-        return None, {"time_source": f"none: file names are not HHMMSSmmm ({error})"}
+        source = f"none: file names are not HHMMSSmmm ({error})"
+        log.warning("times: %s", source)
+        return None, {"time_source": source}
     times, passed = unrolled_midnight(of_day)
     notes: dict[str, Any] = {"time_source": "file names, HHMMSSmmm"}
     if passed:

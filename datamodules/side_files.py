@@ -9,6 +9,7 @@ import csv
 import json
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,15 +131,20 @@ class Table:
         return cell.replace(",", ".") if self.decimal_comma else cell
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path, names_columns: Callable[[list[str]], bool] | None = None) -> Table:
     """A table with a line of column names.
 
-    **Convention:** columns are separated by comma, semicolon, tab or bar, whichever the first line has most of; only
+    **Convention:** columns are separated by comma, semicolon, tab or bar, whichever that line has most of; only
     where they are not separated by commas may a number have a decimal comma. Lines that begin with #, empty ones, and
     Excel's line "sep=;" are skipped.
 
+    Args:
+        path: of the table.
+        names_columns: whether the cells of a line are names of columns: what stands before the first such line, as programs say
+            where and when they measured, is skipped. None, and where there is no such line, for the first one.
+
     Raises:
-        SceneError: it cannot be read, or a row has fewer cells than there are columns; the message names the line.
+        SceneError: it cannot be read, or a row has fewer or more cells than there are columns; the message names the line.
     """
     lines = [
         (number, line)
@@ -147,17 +153,27 @@ def read_table(path: Path) -> Table:
     ]
     if not lines:
         raise SceneError(f"{path} is empty; a line of column names and rows below it are needed")
-    delimiter = max(",;\t|", key=lines[0][1].count)
 
-    def cells(line: str) -> list[str]:
+    def delimiter_of(line: str) -> str:
+        return max(",;\t|", key=line.count)
+
+    def cells(line: str, delimiter: str) -> list[str]:
         try:
             return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
         except csv.Error as error:
             raise SceneError(f"{path}: {shortened(line)} is no row of a table ({error})") from error
 
-    columns = cells(lines[0][1])
-    rows = [(number, row) for number, line in lines[1:] if any(row := cells(line))]
+    named = (i for i, (_, line) in enumerate(lines) if names_columns and names_columns(cells(line, delimiter_of(line))))
+    first = next(named, 0)
+    delimiter = delimiter_of(lines[first][1])
+    columns = cells(lines[first][1], delimiter)
+    rows = [(number, row) for number, line in lines[first + 1 :] if any(row := cells(line, delimiter))]
     for number, row in rows:
         if len(row) < len(columns):
             raise SceneError(f"{path}, line {number}: {len(row)} cells for {len(columns)} columns")
+        if any(row[len(columns) :]):  # 19,5 between commas is two cells, and all behind it stand in the wrong column
+            raise SceneError(
+                f"{path}, line {number}: {len(row)} cells for {len(columns)} columns; separate columns by semicolons where "
+                "numbers have decimal commas, and put text that holds a separator into quotes"
+            )
     return Table(path, columns, rows, decimal_comma=delimiter != ",")

@@ -5,7 +5,7 @@ Positions index the frames as they were passed. ``order`` lists positions in tim
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -89,7 +89,8 @@ def by_subset(subsets: Sequence[str | None]) -> Positions:
 def by_list(names: Sequence[str], path: Path) -> Positions:
     """Positions by a file: test names one per line, or JSON {"train": [...], "test": [...]} (no "train": all others).
 
-    Names may be given with or without their folder and extension; a frame that has a name as a whole goes before others.
+    Names may be given with or without folders and extension, with those of the scene or others; a frame that has a name as a
+    whole goes before others.
 
     Raises:
         SceneError: the file holds no such lists, or a name of no frame, or one that may be of several.
@@ -108,13 +109,21 @@ def by_list(names: Sequence[str], path: Path) -> Positions:
         lists = {"test": [line for line in lines if line]}
     whole = {name: [i] for i, name in enumerate(names)}
     parts: dict[str, list[int]] = {}
+    bare: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         path_in = PurePosixPath(name)
-        for key in {path_in.with_suffix("").as_posix(), path_in.name, path_in.stem}:
+        without = path_in.with_suffix("").as_posix()
+        for key in {without, path_in.name, path_in.stem}:
             parts.setdefault(key, []).append(i)
+        for key in {name, without}:
+            bare.setdefault(key, []).append(i)
+
+    def meant_by(name: str) -> list[int]:
+        known = whole.get(name) or parts.get(name)
+        return known or next((bare[end] for end in _ends(name) if end in bare), [])
 
     def positions(listed: Sequence[str]) -> list[int]:
-        meant = {name: whole.get(name) or parts.get(name, []) for name in listed}
+        meant = {name: meant_by(name) for name in listed}
         unknown = [name for name, found in meant.items() if not found]
         if unknown:
             raise SceneError(
@@ -130,6 +139,14 @@ def by_list(names: Sequence[str], path: Path) -> Positions:
 
     test = positions(lists["test"])
     return (positions(lists["train"]), test) if "train" in lists else _complement(len(names), test)
+
+
+def _ends(name: str) -> Iterator[str]:
+    """A path and what is left of it without folders before, the longest first, each with and without its extension."""
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    for first in range(len(parts)):
+        end = PurePosixPath(*parts[first:])
+        yield from (end.as_posix(), end.with_suffix("").as_posix())
 
 
 @dataclass(frozen=True)

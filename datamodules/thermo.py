@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.base import RawFrame
 from heatsplat.datamodules.bounds import celsius_in, range_in
-from heatsplat.datamodules.file_names import stem_of
+from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.posed_frames import FILES, image_index, listed_frames, match_model, mesh_points, model_frames
 from heatsplat.datamodules.side_files import finite, json_object, mapping, shortened
@@ -74,10 +73,14 @@ class Thermo(OutdoorDataModule):
         path = folder / META_FILE
         meta = json_object(path)
         bounds = {k: celsius_in(meta, k, path) if own is None else own for k, own in self.bounds_c.items()}
-        frames, scene, notes = self._posed(folder, meta)
+        frames, scene, rows, notes = self._posed(folder, meta)
         if self.test_period is not None:
             frames = self._by_period(frames)
         surroundings = self.surroundings.read(folder, meta, frames)
+        tables = {key: surroundings[key] for key in ("labels", "point_features") if surroundings[key] is not None}
+        if tables and rows is not None:
+            order = rows()
+            surroundings |= {key: v[order] if len(v) == len(order) else v for key, v in tables.items()}
         if surroundings["weather"] is not None:  # one source for all frames
             frames = [replace(frame, environment=None) for frame in frames]
         ambient_c = meta.get("ambient_c") if self.ambient_c is None else self.ambient_c
@@ -96,34 +99,59 @@ class Thermo(OutdoorDataModule):
             thermal_range=range_in(path, bounds["min_value"], bounds["max_value"])[0],
             ambient_c=ambient_c,
             metres_per_unit=metres,
-            notes={"layout": "our convention for Thermo, which is not published", **notes},
+            notes={
+                "layout": "our convention for Thermo, which is not published",
+                "bounds_source": f"{META_FILE}, or data.min_c and data.max_c",
+                **notes,
+            },
             **scene,
             **surroundings,
         )
 
     def _posed(
         self, folder: Path, meta: Mapping[str, Any]
-    ) -> tuple[list[RawFrame], dict[str, np.ndarray | None], dict[str, Any]]:
-        """Frames, points with their colours, and notes, from the JSON files or the sparse model."""
+    ) -> tuple[list[RawFrame], dict[str, np.ndarray | None], Callable[[], np.ndarray] | None, dict[str, Any]]:
+        """Frames, points with their colours, what tells their rows in a file of another order, and notes, from the JSON files or
+        the sparse model."""
         if _has_transforms(folder):
-            frames, notes = listed_frames(self, folder, partial(self._described, meta))
+            entries: list[Mapping[str, Any]] = []
+            frames, notes = listed_frames(self, folder, lambda entry, _: entries.append(entry) or {})
             points, origin = mesh_points(folder, frames, self.random_points, self.seed)
-            return frames, {"points": points}, notes | origin
+            return self._described(meta, frames, entries), {"points": points}, None, notes | origin
         model = read_model(folder)
         index = image_index(folder, "images", "the folder of thermal images")
         files = {name: index.find(name) for name in model.names}
         _, notes = match_model(model, files, index, "images")
-        frames = model_frames(self, folder, model, files, index.folder, describe=partial(self._described, meta, {}))
-        return frames, {"points": model.points, "point_colors": model.colors}, {"cameras": "sparse/0", **notes}
+        frames = model_frames(self, folder, model, files, index.folder)
+        scene = {"points": model.points, "point_colors": model.colors}
+        notes = {"cameras": "sparse/0", **notes}
+        return self._described(meta, frames, [{}] * len(frames)), scene, model.rows, notes
 
-    def _described(self, meta: Mapping[str, Any], entry: Mapping[str, Any], file: str) -> dict[str, Any]:
-        """Time, weather and subset of a frame, from its own entry or from meta.json's."""
+    def _described(
+        self, meta: Mapping[str, Any], frames: Sequence[RawFrame], entries: Sequence[Mapping[str, Any]]
+    ) -> list[RawFrame]:
+        """The frames with their times, weather and subsets, from their own entries or from meta.json's.
+
+        Raises:
+            SceneError: meta.json names none of the frames, or says something of one that cannot be.
+        """
         listed = mapping(meta.get("frames"), f"{META_FILE}: 'frames'")
-        also = next(
-            (listed[key] for key in (file, Path(file).with_suffix("").as_posix(), stem_of(file)) if key in listed), {}
-        )
-        where = f"{META_FILE}, frame {file}"
-        known = {**mapping(also, where), **entry}
+        found = same_files([frame.name for frame in frames], listed)
+        if listed and not any(found.values()):
+            raise SceneError(
+                f"{META_FILE}: 'frames' names none of the scene's frames: {next(iter(listed))} is not among "
+                f"{frames[0].name}, ..."
+            )
+
+        def described(frame: RawFrame, entry: Mapping[str, Any]) -> RawFrame:
+            key = frame.name if frame.name in listed else next(iter(found[frame.name]), None)
+            where = f"{META_FILE}, frame {frame.name}"
+            return replace(frame, **self._known({**mapping(listed.get(key), where), **entry}, meta, where))
+
+        return [described(frame, entry) for frame, entry in zip(frames, entries, strict=True)]
+
+    def _known(self, known: Mapping[str, Any], meta: Mapping[str, Any], where: str) -> dict[str, Any]:
+        """Time, weather and, where it is said, subset of a frame, as fields of ``RawFrame``."""
         time = None
         if known.get("utc") is not None:
             time = utc_seconds(known["utc"], self.surroundings.zone, where)

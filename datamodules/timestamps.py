@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime, tzinfo
@@ -112,6 +113,8 @@ def times_from_csv(path: Path, name_column: str, time_column: str) -> dict[str, 
         cell = row[time_at]
         try:
             seconds = seconds_of(table.pointed(cell))
+            if not math.isfinite(seconds):
+                raise ValueError(cell)
         except ValueError as error:
             raise SceneError(
                 f"{path}, line {number}: {cell!r} in column {time_column} is neither seconds nor a date-time "

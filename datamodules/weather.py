@@ -81,6 +81,11 @@ def make_weather(
         _check_range(name, values, times_s, source)
     times_s, columns, notes = _in_order(np.asarray(times_s, dtype=np.float64), columns, notes)
     columns = {name: values for name, values in columns.items() if np.isfinite(values).sum() >= 2}
+    if "humidity_percent" in columns and 0 < (most := float(np.nanmax(columns["humidity_percent"]))) <= 1:
+        raise SceneError(
+            f"{source}: humidity_percent is {most:g} at the most, drier than any air. Shares are no per cent: name such a column "
+            "humidity_fraction, or multiply by 100"
+        )
     for name in (RAIN, FALLEN):  # which many records leave out where none fell
         if name in columns and (gaps := int(np.isnan(columns[name]).sum())):
             columns[name] = np.nan_to_num(columns[name])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import logging
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ log = logging.getLogger(__name__)
 PYRANOMETER_OFFSET = -5.0
 # Numbers from here on are seconds since 1970, below it seconds on the clock of the frames.
 FIRST_EPOCH_S = 1e8
+LAST_EPOCH_S = 9e9  # in the year 2255; milliseconds since 1970 are more
 MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
 
 
@@ -123,17 +125,23 @@ def read_columns(path: Path, zone: str | None) -> tuple[np.ndarray, dict[str, np
     """
     if not path.is_file():
         raise SceneError(f"there is no weather table {path}")
-    table = read_table(path)
+    table = read_table(path, lambda cells: any(_plain(cell) in TIME_NAMES for cell in cells))
     if len(table.rows) < 2:
         raise SceneError(f"{path} holds no weather: a line of column names and two or more samples are needed")
     header = table.columns
     time_at = _time_column(header, path)
     wanted, unused = _columns_of(header, time_at, path)
     own_zone = "UTC" if _plain(header[time_at]).endswith("utc") else zone
-    times, values = [], {name: [] for name in wanted}
-    for number, cells in table.rows:
+
+    def seconds_in(number: int, cells: Sequence[str], after: float | None = None) -> float:
         where = f"{path}, line {number}, column {header[time_at]}"
-        times.append(utc_seconds(table.pointed(cells[time_at]), own_zone, where, times[-1] if times else None))
+        return utc_seconds(table.pointed(cells[time_at]), own_zone, where, after)
+
+    # Tables with the newest row first are read from their end, so that of an hour that clocks show twice the earlier comes first.
+    backwards = seconds_in(*table.rows[0]) > seconds_in(*table.rows[-1])
+    times, values = [], {name: [] for name in wanted}
+    for number, cells in table.rows[:: -1 if backwards else 1]:
+        times.append(seconds_in(number, cells, times[-1] if times else None))
         for name, (position, (scale, offset)) in wanted.items():
             cell = cells[position]
             if cell.lower() in MISSING:
@@ -227,12 +235,16 @@ def utc_seconds(text: str | float, zone: str | None, where: str, after: float | 
             where the first would not come after that.
 
     Raises:
-        SceneError: it is neither, or it has no offset and ``zone`` is None; ``where`` is named.
+        SceneError: it is neither, or beyond the year 2255, or it has no offset and ``zone`` is None; ``where`` is named.
     """
     try:
-        return float(text)
+        number = float(text)
     except (ValueError, TypeError, OverflowError):
         pass
+    else:
+        if LAST_EPOCH_S < number < math.inf:
+            raise SceneError(f"{where}: {text} lies beyond the year 2255; divide milliseconds since 1970 by 1000")
+        return number
     try:
         moment = datetime.fromisoformat(str(text).strip())
     except ValueError as error:
@@ -257,6 +269,8 @@ def _plain(name: str) -> str:
     text = (
         name.strip()
         .lower()
+        .replace("⁻", "-")
+        .replace("¹", "1")
         .replace("²", "2")
         .replace("%", "percent")
         .replace("°", "")

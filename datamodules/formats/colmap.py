@@ -10,7 +10,7 @@ import numpy as np
 
 from heatsplat.contracts import Camera, SceneError
 from heatsplat.datamodules.formats.colmap_library import pycolmap
-from heatsplat.datamodules.formats.colmap_records import check_records
+from heatsplat.datamodules.formats.colmap_records import check_records, names_in_text, point_ids_in
 from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
@@ -27,6 +27,7 @@ class SparseModel:
         lenses: lens of each name.
         points: [P, 3] float64.
         colors: [P, 3] float64 in [0, 1].
+        point_ids: [P] numbers of the points, which are in the order of COLMAP's own table in memory.
     """
 
     folder: Path
@@ -35,6 +36,12 @@ class SparseModel:
     lenses: tuple[Lens, ...]
     points: np.ndarray
     colors: np.ndarray
+    point_ids: tuple[int, ...]
+
+    def rows(self) -> np.ndarray:
+        """Row [P] of each point in the file of points, for what is written in the order of that."""
+        row_of = {number: row for row, number in enumerate(point_ids_in(self.folder))}
+        return np.array([row_of[number] for number in self.point_ids], dtype=np.int64)
 
 
 def find_model(scene: Path) -> Path | None:
@@ -79,17 +86,22 @@ def read_model_of(folder: Path) -> SparseModel:
         key: lens_of(c.model.name, list(c.params), c.width, c.height, f"{folder}, camera {key}")
         for key, c in model.cameras.items()
     }
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    told = names_in_text(folder / "images.txt") if suffix == "txt" else {}
+    posed = [image for image in model.images.values() if image.has_pose]
+    names = [told.get(image.image_id, image.name).replace("\\", "/") for image in posed]  # as written on Windows
+    named = sorted(zip(names, posed, strict=True), key=lambda one: one[0])
+    images = [image for _, image in named]
     if not images:
         raise SceneError(f"sparse model {folder} has no registered image; reconstruct the scene again")
-    points = list(model.points3D.values())
+    ids, points = list(model.points3D.keys()), list(model.points3D.values())
     return SparseModel(
         folder=folder,
-        names=tuple(image.name for image in images),
+        names=tuple(name for name, _ in named),
         viewmats=tuple(pose_matrix(image) for image in images),
         lenses=tuple(lenses[image.camera_id] for image in images),
         points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
         colors=np.array([p.color for p in points], dtype=np.float64).reshape(-1, 3) / 255.0,
+        point_ids=tuple(ids),
     )
 
 

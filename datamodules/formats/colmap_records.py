@@ -60,6 +60,32 @@ def announced_images(folder: Path) -> int:
         return 0
 
 
+def names_in_text(file: Path) -> dict[int, str]:
+    """Name of every image in an images.txt that is whole, by its number: COLMAP's own reader ends one at its first space."""
+    lines = iter(file.read_text(encoding="utf-8", errors="replace").splitlines())
+    names = {}
+    for line in map(str.strip, lines):
+        if line and not line.startswith("#"):
+            number, *_, name = line.split(maxsplit=9)
+            names[int(number)] = name
+            next(lines, None)  # its points
+    return names
+
+
+def point_ids_in(folder: Path) -> list[int]:
+    """Numbers of the points of a whole model, in the order of its file."""
+    binary = folder / "points3D.bin"
+    if not binary.is_file():
+        lines = map(str.strip, (folder / "points3D.txt").read_text(encoding="utf-8", errors="replace").splitlines())
+        return [int(line.split(maxsplit=1)[0]) for line in lines if line and not line.startswith("#")]
+    data = binary.read_bytes()
+    at, ids = _COUNT.size, []
+    while at < len(data):
+        ids.append(_COUNT.unpack_from(data, at)[0])
+        at = _point(data, at)
+    return ids
+
+
 def _announced(line: str) -> int | None:
     """The number of records that a comment in a text file tells, or None."""
     word = line.partition(":")[2].partition(",")[0].strip()

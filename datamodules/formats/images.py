@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import mmap
+import os
 import struct
+import unicodedata
 import zlib
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
@@ -79,7 +81,20 @@ def _only(path: Path) -> np.ndarray | None:
             f"image {path} is a TIFF of {count} images, and one is expected; write each into a file of its own, or prepare the "
             "file (src/prepare.py), which takes every one"
         )
+    _check_channels(path)
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def _check_channels(path: Path) -> None:
+    """Raises SceneError for a TIFF with channels that OpenCV does not decode, or of which it leaves the upper eight bits."""
+    channels = bits = None
+    with path.open("rb") as file, suppress(struct.error, ValueError, OverflowError):
+        *_, bits, channels, _ = next(_tiff_pages(file), (0, (None,) * 6))[1]
+    if channels not in (None, 1, 3, 4) and (channels, bits) != (2, 8):
+        raise SceneError(
+            f"image {path} has {channels} channels of more than 8 bits; supported are 1, 3 and 4: write the one with the "
+            "temperatures into a file of its own (gdal_translate -b 1 IN.tif OUT.tif)"
+        )
 
 
 def _one_of(path: Path, page: int) -> np.ndarray | None:
@@ -196,13 +211,34 @@ def list_images(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in shown_files(folder, SUFFIXES))
 
 
-def shown_files(folder: Path, suffixes: Collection[str]) -> Iterator[Path]:
+def shown_files(folder: Path, suffixes: Collection[str], above: frozenset[str] = frozenset()) -> Iterator[Path]:
     """Files below ``folder`` whose names end so, in lower case; none that is hidden (".") or in a hidden folder, such as what
-    macOS puts beside each file of a card ("._IMG_0042.jpg") and the thumbnails of other programs."""
-    for path in folder.rglob("*"):
-        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
-        if not hidden and path.suffix.lower() in suffixes:
-            yield path
+    macOS puts beside each file of a card ("._IMG_0042.jpg") and the thumbnails of other programs.
+
+    Links to folders are followed, as data often lie on another disk.
+
+    Args:
+        folder: to look in; nothing comes of one that cannot be read.
+        suffixes: with their points.
+        above: folders that this one was reached through, which links in it do not lead back into.
+    """
+    here = os.path.realpath(folder)
+    if here in above or not folder.is_dir():
+        return
+    with suppress(PermissionError), os.scandir(folder) as entries:
+        for entry in entries:
+            path = folder / entry.name
+            if entry.name.startswith("."):
+                continue
+            if entry.is_dir():
+                yield from shown_files(path, suffixes, above | {here})
+            elif path.suffix.lower() in suffixes:
+                yield path
+
+
+def _alike(name: str) -> str:
+    """What names have in common that differ in case, or in how umlauts are written: macOS takes letters and their marks apart."""
+    return unicodedata.normalize("NFC", name).lower()
 
 
 class ImageIndex:
@@ -216,7 +252,7 @@ class ImageIndex:
         self.folder = folder
         self.names = list_images(folder) if folder.is_dir() else []
         self._exact = set(self.names)
-        self._by_stem = {name.rsplit(".", 1)[0].lower(): name for name in reversed(self.names)}
+        self._by_stem = {_alike(name.rsplit(".", 1)[0]): name for name in reversed(self.names)}
 
     def find(self, name: str) -> str | None:
         """The stored name that matches ``name`` exactly or up to extension and case, or None."""
@@ -224,7 +260,7 @@ class ImageIndex:
             return name
         head, _, tail = name.rpartition(".")
         stem = head if f".{tail.lower()}" in SUFFIXES else name
-        return self._by_stem.get(stem.lower())
+        return self._by_stem.get(_alike(stem))
 
     def unused(self, used: Iterable[str]) -> list[str]:
         """Stored names that are not among ``used``."""

@@ -138,6 +138,9 @@ def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tu
         SceneError: no focal length, a camera model that is not supported, or distortion that the model does not have.
     """
     values = {**transforms.values, **frame}
+    for axis in "xy":  # a frame's own field of view goes before the file's focal length
+        if f"camera_angle_{axis}" in frame and f"fl_{axis}" not in frame:
+            values.pop(f"fl_{axis}", None)
     said = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")).upper()
     model = _COLMAP_NAME.get(said, said)
     source = f"{transforms.path}, {frame['file_path']}"
@@ -158,7 +161,13 @@ def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tu
             + ("" if meant == said else f"say camera_model {meant} if it is one of that, or ")
             + f"undistort the images and take {beyond} out"
         )
-    width, height = (int(number("w")), int(number("h"))) if "w" in values and "h" in values else size()
+    sized = "w" in values and "h" in values
+    width, height = (int(number("w")), int(number("h"))) if sized else size()
+    if not sized and not (0 <= number("cx") <= width and 0 <= number("cy") <= height):
+        raise SceneError(
+            f"{source}: the principal point {number('cx'):g}, {number('cy'):g} lies outside its image of {width}x{height}, and w "
+            "and h are missing: give those of the images that focal length and principal point are for"
+        )
     fx = _focal(values, "x", width, source)
     if fx is None:
         raise SceneError(f"{source}: no focal length; fl_x or camera_angle_x is needed")

@@ -63,10 +63,11 @@ def test_without_times_there_are_none():
     assert scene.notes["time"].startswith("none")
 
 
-def test_times_of_some_frames_only_are_not_used():
+def test_times_of_some_frames_only_are_not_used(caplog):
     scene = scene_of([grey(i) for i in range(9)], times=[0.0, None, *range(2, 9)])
     assert set(scene.train.times_s) == {None}
-    assert "only 8 of 9 frames have a time" in scene.notes["time"]
+    assert "8 of 9 frames have a time, 001.png has not, so none is used" in scene.notes["time"]
+    assert scene.notes["time"] in caplog.text
 
 
 def test_duplicate_times_are_kept_and_noted(caplog):
@@ -123,6 +124,17 @@ def test_a_few_hot_pixels_are_within_the_bounds_of_training_images(caplog):
     np.testing.assert_allclose(shown, images[3], atol=1e-4)
     assert 90.0 < scene.thermal_range.max_c < 91.0 and scene.notes["clipped_fraction"] == 0
     assert "cut off" not in caplog.text
+
+
+def test_what_masks_leave_out_is_not_cut_off():
+    """A sky far colder than all that counts, beyond the bounds that this sets."""
+    images = [20 + grey(i).astype(np.float32) / 10 for i in range(9)]
+    sky = np.zeros((HEIGHT, WIDTH), bool)
+    sky[: HEIGHT // 2] = True
+    for image in images:
+        image[sky] = -40.0
+    scene = scene_of(images, frames_of(images, read_mask=[lambda: ~sky] * 9))
+    assert scene.thermal_range.min_c > 15 and scene.notes["clipped_fraction"] < 0.01  # held-out images go on a little
 
 
 def test_dead_pixels_and_counts_of_absolute_zero_set_no_bounds_and_are_warned_of(caplog):
@@ -341,6 +353,29 @@ def test_visible_images_share_the_thermal_grid():
     assert view.rgb.shape == (HEIGHT // 2, WIDTH // 2, 3)
     np.testing.assert_allclose(view.rgb[0, 0] * 255, [30, 20, 30], atol=1e-4)
     assert scene.notes["rgb_resized"].startswith("9 visible")
+
+
+@pytest.mark.parametrize(
+    ("sides", "told"), [((WIDTH * 2, HEIGHT * 2), False), ((HEIGHT, WIDTH), True), ((48, 32), True)]
+)
+def test_visible_images_of_another_shape_are_told(caplog, sides, told):
+    rgb = np.zeros((sides[1], sides[0], 3), np.uint8)
+    frames = frames_of([grey(i) for i in range(9)], read_rgb=[lambda: rgb] * 9)
+    scene = scene_of(None, frames=frames)
+    assert ("9 visible images have another shape than the thermal ones" in caplog.text) is told
+    assert ("9 of which have another shape" in scene.notes["rgb_resized"]) is told
+
+
+@pytest.mark.parametrize("image", [grey(0), grey(0).astype(np.float32)])
+def test_masks_that_are_the_wrong_way_round_are_told(caplog, image):
+    few, none = np.zeros((2, HEIGHT, WIDTH), bool)
+    few[3:6, 3:9] = True
+    scene_of(None, frames_of([image] * 9, read_mask=[lambda: ~few] * 9))
+    assert not caplog.text
+    scene_of(None, frames_of([image] * 9, read_mask=[lambda: few] * 9))
+    assert "masks or transparency leave out 98.59 % of all pixels; data.mask_keep is white where" in caplog.text
+    with pytest.raises(SceneError, match="leave out all pixels of all images; data.mask_keep"):
+        scene_of(None, frames_of([image] * 9, read_mask=[lambda: none] * 9))
 
 
 def test_masks_must_fit_the_image():

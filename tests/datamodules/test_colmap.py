@@ -51,6 +51,21 @@ def test_cameras_points_and_pixels_come_back(tmp_path, text, place):
     json.dumps(scene.notes)  # the report writes them
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_names_may_have_spaces(tmp_path, text):
+    files = names(9, "flight 2/frame {:03d} T.png")
+    write_colmap(tmp_path, files, text=text)
+    assert [frame.name for frame in loaded(tmp_path).test.frames] == [files[0], files[8]]
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_names_may_have_folders_in_the_way_of_windows(tmp_path, text):
+    write_colmap(tmp_path, names(9, "left\\frame_{:03d}.png"), text=text, images=None)
+    for i, name in enumerate(names(9, "left/frame_{:03d}.png")):
+        write_image(tmp_path / "images" / name, grey(i))
+    assert [frame.name for frame in loaded(tmp_path).test.frames] == ["left/frame_000.png", "left/frame_008.png"]
+
+
 def test_the_root_may_be_the_scene_and_relative(tmp_path, monkeypatch):
     write_colmap(tmp_path / "data" / "s", names(9))
     monkeypatch.chdir(tmp_path)
@@ -176,6 +191,27 @@ def test_masks_follow_colmap_s_rule(tmp_path, keep, suffix):
     assert (scene.train[0].mask.numpy() == expected).all()
     assert scene.train[-1].mask is None
     assert scene.notes["masks"].startswith("4 of 9 images have a mask")
+
+
+def test_masks_that_are_not_used_are_told(tmp_path, caplog):
+    write_colmap(tmp_path, names(9))
+    for i in range(9):
+        write_image(tmp_path / "masks" / f"mask_{i:03d}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    assert loaded(tmp_path).train[0].mask is None
+    assert "masks: none of its 9 files is named after an image, such as frame_000.png.png, and no mask" in caplog.text
+    caplog.clear()
+    assert loaded(tmp_path, masks=None).train[0].mask is None and not caplog.text
+    with pytest.raises(SceneError, match="data.masks=mask: there is no folder .*/mask; data.masks=null uses no masks"):
+        loaded(tmp_path, masks="mask")
+
+
+def test_visible_images_of_other_names_are_refused(tmp_path):
+    write_colmap(tmp_path, names(9))
+    write_image(tmp_path / "rgb" / "photo_0.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    with pytest.raises(
+        SceneError, match=r"data.rgb=rgb: no file in .*like 'photo_0.png', and images like 'frame_000.png'"
+    ):
+        loaded(tmp_path, rgb="rgb")
 
 
 def test_visible_images_beside_the_thermal_ones(tmp_path):

@@ -272,7 +272,9 @@ def test_json_with_a_byte_order_mark_and_decimal_commas_is_read(tmp_path):
         ("file,time_s\na\n", "t.csv, line 2: 1 cells for 2 columns"),
         ("", "t.csv is empty"),
         ("\0\xff", "no such column|no text file"),
-        ("file,time_s\na,1e999\nframe_001,0\n", "t.csv has no row|absurdly large"),
+        ("file,time_s\na,1,5\nb,2,5\n", "t.csv, line 2: 3 cells for 2 columns; separate columns by semicolons"),
+        ("file,time_s\na,1e999\nframe_001,0\n", "t.csv, line 2: '1e999' in column time_s is neither"),
+        ("file,time_s\na,nan\n", "t.csv, line 2: 'nan' in column time_s is neither"),
     ],
 )
 def test_damaged_tables_of_times_are_refused(tmp_path, text, message):

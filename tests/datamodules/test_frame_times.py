@@ -40,8 +40,10 @@ def test_without_anything_dji_names_tell_and_other_names_do_not(tmp_path):
     assert FrameTimes().of(tmp_path, (*DJI, "other.png")) == (None, "none (set data.time_regex or data.time_csv)")
 
 
-def test_frames_csv_without_all_images_has_no_times(folder):
-    assert FrameTimes().of(folder, (*NAMES, "a_030.png"))[0] is None
+def test_frames_csv_without_all_images_has_no_times_and_says_which(folder, caplog):
+    times, note = FrameTimes().of(folder, (*NAMES, "a_030.png"))
+    assert times is None and note == "none (frames.csv has those of 2 of 3 images, and none of a_030.png)"
+    assert "frames.csv has those of 2 of 3 images" in caplog.text
 
 
 def test_a_table_that_lacks_an_image_is_refused(folder):

@@ -1,3 +1,6 @@
+import struct
+import unicodedata
+
 import cv2
 import numpy as np
 import pytest
@@ -6,6 +9,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats.images import (
     ImageIndex,
     colour_levels,
@@ -106,11 +110,42 @@ def test_other_pixel_types_are_refused(tmp_path):
         read_image(tmp_path / "a.tiff")
 
 
+@pytest.mark.parametrize(("channels", "bits"), [(2, 16), (5, 16), (2, 32)])
+def test_channels_that_are_not_decoded_are_refused(tmp_path, channels, bits):
+    """Of grey with alpha in 16 bits OpenCV leaves the upper eight."""
+    path = tmp_path / "a.tif"
+    tags = {256: 4, 257: 2, 258: bits, 277: channels}  # width, height, bits and number of channels
+    entries = b"".join(struct.pack("<HHIHH", tag, 3, 1, value, 0) for tag, value in tags.items())
+    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(4))
+    with pytest.raises(SceneError, match=f"has {channels} channels of more than 8 bits; supported are 1, 3 and 4"):
+        read_image(path)
+
+
 def test_hidden_files_are_no_images(tmp_path):
     for name in ("a.png", ".hidden/a.png"):
         write_image(tmp_path / name, np.zeros((2, 2), np.uint8))
     (tmp_path / "._a.png").write_bytes(b"\0\x05\x16\x07")
     assert ImageIndex(tmp_path).names == ["a.png"] and ImageIndex(tmp_path / ".hidden").names == ["a.png"]
+
+
+def test_links_to_folders_are_followed_once(tmp_path):
+    write_image(tmp_path / "disk" / "flight" / "a.png", np.zeros((2, 2), np.uint8))
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    (scene / "thermal").symlink_to(tmp_path / "disk" / "flight")
+    (scene / "again").symlink_to(tmp_path / "disk" / "flight")
+    (tmp_path / "disk" / "flight" / "back").symlink_to(scene)
+    (tmp_path / "disk" / "flight" / "itself").symlink_to(tmp_path / "disk")
+    names = ImageIndex(scene).names
+    assert {"thermal/a.png", "again/a.png"} <= set(names) and len(names) < 8
+
+
+def test_names_with_umlauts_are_found_however_these_are_written(tmp_path):
+    one, two = (unicodedata.normalize(form, "Köln_1.png") for form in ("NFC", "NFD"))
+    write_image(tmp_path / "1.png", np.zeros((2, 2), np.uint8))
+    (tmp_path / "1.png").rename(tmp_path / two)
+    assert one != two and ImageIndex(tmp_path).find(one) == two
+    assert same_files([one], [two]) == {one: [two]}
 
 
 def test_names_are_found_up_to_case_and_extension(tmp_path):

@@ -2,17 +2,20 @@
 
 import json
 import logging
+import math
 import shutil
 
 import numpy as np
 import pytest
 import torch
 from layouts import FOCAL, HEIGHT, WIDTH, grey, names, opengl, viewmats, write_colmap, write_image, write_json
+from plyfile import PlyData, PlyElement
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
-from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in
+from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in, read_transforms
 from heatsplat.datamodules.nerfstudio import Nerfstudio
+from heatsplat.datamodules.points import ply_points
 
 LENS = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 20.0, "cy": 16.0, "w": WIDTH, "h": HEIGHT}
 
@@ -135,6 +138,89 @@ def test_fields_of_view_tell_both_focal_lengths(tmp_path):
         assert [float(K[0, 0]), float(K[1, 1])] == pytest.approx([fx, fy]), given
 
 
+@pytest.mark.parametrize(
+    ("of_file", "of_frame", "found"),
+    [
+        ({"fl_x": 30, "fl_y": 32}, {}, (30, 32)),
+        ({"fl_x": 30}, {"camera_angle_x": 2 * math.atan(0.4)}, (WIDTH / 0.8, WIDTH / 0.8)),
+        ({"fl_x": 30, "fl_y": 32}, {"camera_angle_y": 2 * math.atan(0.4)}, (30, HEIGHT / 0.8)),
+        ({"camera_angle_x": 1, "camera_angle_y": 1}, {"fl_x": 50, "fl_y": 52}, (50, 52)),
+    ],
+)
+def test_a_frame_s_own_field_of_view_goes_before_the_focal_length_of_the_file(tmp_path, of_file, of_frame, found):
+    write_json(tmp_path / "t.json", {**of_file, "frames": [{"file_path": "a.png", "transform_matrix": [], **of_frame}]})
+    transforms = read_transforms(tmp_path / "t.json")
+    lens = lens_in(transforms, transforms.frames[0], lambda: (WIDTH, HEIGHT))
+    assert (lens.fx, lens.fy) == pytest.approx(found)
+
+
+def test_a_principal_point_of_larger_images_needs_their_size(tmp_path):
+    values = {"fl_x": 76, "cx": 41, "cy": 30, "frames": [{"file_path": "a.png", "transform_matrix": []}]}
+    write_json(tmp_path / "t.json", values)
+    transforms = read_transforms(tmp_path / "t.json")
+    with pytest.raises(
+        SceneError, match=f"t.json, a.png: the principal point 41, 30 lies outside its image of {WIDTH}x{HEIGHT}"
+    ):
+        lens_in(transforms, transforms.frames[0], lambda: (WIDTH, HEIGHT))
+    lens = lens_in(transforms, {**transforms.frames[0], "w": 80, "h": 64}, lambda: (WIDTH, HEIGHT))
+    assert lens.resized(WIDTH, HEIGHT).fx == 38
+
+
+@pytest.mark.parametrize("form", ["valley_{:03d}.png", "terrain_{:03d}.png", "latest_train_{:03d}.png", "f_{:03d}.png"])
+def test_words_that_all_names_have_split_nothing(tmp_path, form):
+    frames = [{"file_path": f"thermal/{form.format(i)}"} for i in range(9)]
+    for i, frame in enumerate(frames):
+        write_image(tmp_path / frame["file_path"], grey(i))
+    write_frames(tmp_path, frames)
+    scene = loaded(tmp_path)
+    assert [f.name for f in scene.test.frames] == [form.format(0), form.format(8)]
+    assert "tell train and test apart" in scene.notes["split_assumed"]
+
+
+@pytest.mark.parametrize(("said", "found"), [("some\\cloud.ply", True), ("cloud.ply", False)])
+def test_the_point_cloud_that_the_file_names_is_found_or_missed(tmp_path, caplog, said, found):
+    frames = [{"file_path": f"thermal/{i}.png"} for i in range(9)]
+    for i, frame in enumerate(frames):
+        write_image(tmp_path / frame["file_path"], grey(i))
+    write_frames(tmp_path, frames, ply_file_path=said)
+    rows = np.array([(i, i % 3, i % 2) for i in range(30)], dtype=[(axis, "f4") for axis in "xyz"])
+    (tmp_path / "some").mkdir()
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "some" / "cloud.ply"))
+    scene = loaded(tmp_path)
+    assert (len(scene.points) == 30) is found and ("points_random" in scene.notes) is not found
+    assert ("ply_file_path of transforms.json is cloud.ply, which is not there" in caplog.text) is not found
+
+
+@pytest.mark.parametrize(("kind", "red"), [("u1", 204), ("f4", 204), ("f4", 0.8)])
+def test_colours_of_points_are_bytes_or_shares(tmp_path, kind, red):
+    rows = np.zeros(4, dtype=[(axis, "f4") for axis in "xyz"] + [(colour, kind) for colour in ("red", "green", "blue")])
+    rows["red"] = red
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "points.ply"))
+    _, colours = ply_points(tmp_path / "points.ply")
+    assert colours.max(axis=0).tolist() == pytest.approx([0.8, 0, 0])
+
+
+def test_a_frame_s_own_mask_goes_before_that_of_its_name(tmp_path):
+    own, of_name = np.zeros((2, HEIGHT, WIDTH), np.uint8)
+    own[:, 3:], of_name[:, 9:] = 255, 255
+    frames = [{"file_path": f"thermal/{i}.png"} for i in range(9)]
+    for i, frame in enumerate(frames):
+        write_image(tmp_path / frame["file_path"], grey(i))
+    write_image(tmp_path / "masks" / "1.png", of_name)
+    write_image(tmp_path / "masks" / "2.png", of_name)
+    write_image(tmp_path / "masks" / "people.png", own)
+    frames[1]["mask_path"] = "masks\\people.png"
+    write_frames(tmp_path, frames)
+    masks = [view.mask for view in loaded(tmp_path).train]
+    assert (
+        masks[0].sum() == own.astype(bool).sum() and masks[1].sum() == of_name.astype(bool).sum() and masks[2] is None
+    )
+    frames[1]["mask_path"] = "masks/nobody.png"
+    write_frames(tmp_path, frames)
+    with pytest.raises(SceneError, match="mask_path of thermal/1.png is masks/nobody.png, which is not there"):
+        loaded(tmp_path)
+
+
 def test_paths_of_windows_are_paths(tmp_path):
     """colmap2nerf of instant-ngp writes the folder of the images as the system does."""
     for i in range(9):
@@ -197,6 +283,17 @@ def test_a_folder_thermal_with_cameras_of_its_own(tmp_path):
     assert view.rgb is None
 
 
+def test_cameras_of_photos_are_not_those_of_thermal_images_that_have_their_own(tmp_path, caplog):
+    for i, name in enumerate(names(9)):
+        write_image(tmp_path / "thermal" / "images" / name, grey(i))
+        write_image(tmp_path / "images" / name, photo(i))
+    for folder in (tmp_path, tmp_path / "thermal"):
+        write_frames(folder, [{"file_path": f"images/{name}"} for name in names(9)])
+    assert loaded(tmp_path).train[0].thermal is None
+    assert f"for those in thermal/ give data.root={tmp_path}/thermal data.scene=null" in caplog.text
+    assert loaded(tmp_path / "thermal").train[0].rgb is None
+
+
 def test_images_without_any_known_key_are_refused(tmp_path):
     write_frames(tmp_path, [{"picture": "a.png"}])
     with pytest.raises(SceneError, match="frame 0 has no key 'file_path'; it has picture, transform_matrix"):
@@ -222,6 +319,30 @@ def two_cameras(folder, lists):
         write_image(folder / file, grey(i))
     write_frames(folder, [{"file_path": file} for file in files], **lists(files))
     return loaded(folder)
+
+
+@pytest.mark.parametrize("file", ["transforms.json", "transforms_{}.json"])
+def test_folders_may_go_on_in_that_of_thermal_images(tmp_path, file):
+    frames = {part: [{"file_path": f"./{part}/{i}.png"} for i in range(4)] for part in ("train", "test")}
+    for at, (part, listed) in enumerate(frames.items()):
+        for i, frame in enumerate(listed):
+            write_image(tmp_path / frame["file_path"], photo(4 * at + i))
+            write_image(tmp_path / "thermal" / frame["file_path"], grey(4 * at + i))
+        write_frames(tmp_path, listed if "{}" in file else [*frames["train"], *frames["test"]], file.format(part))
+    scene = loaded(tmp_path, split="folders")
+    assert [frame.name for frame in scene.test.frames] == [f"thermal/test/{i}.png" for i in range(4)]
+    assert np.allclose(scene.test[2].thermal[..., 0].numpy() * 255, grey(6), atol=0.5)
+    assert np.allclose(scene.test[2].rgb.numpy() * 255, photo(6), atol=0.5)
+
+
+def test_one_thermal_image_of_two_cameras_is_refused(tmp_path):
+    frames = [{"file_path": f"images/{camera}/{i}.png"} for camera in ("left", "right") for i in range(4)]
+    for i, frame in enumerate(frames):
+        write_image(tmp_path / frame["file_path"], photo(i))
+        write_image(tmp_path / "thermal" / f"{i % 4}.png", grey(i))
+    write_frames(tmp_path, frames)
+    with pytest.raises(SceneError, match="of both images/left/0.png and images/right/0.png would be thermal/0.png"):
+        loaded(tmp_path)
 
 
 def test_lists_tell_files_of_one_name_apart_by_their_folders(tmp_path):

@@ -32,6 +32,16 @@ def test_images_and_models_that_differ_are_matched_and_noted(tmp_path, caplog):
     assert scene.notes["images_unregistered"].startswith("1 file not in the model, unused: extra.png")
 
 
+def test_photos_beside_thermal_images_lack_no_camera(tmp_path):
+    files = names(9, "DJI_20240806173449_{:04d}_T.png")
+    write_colmap(tmp_path, files)
+    for other in (*(file.replace("_T.png", "_V.jpg") for file in files), "DJI_20240806173449_0009_T.png"):
+        write_image(tmp_path / "images" / other, grey(0))
+    notes = loaded(tmp_path).notes
+    assert notes["images_beside"].startswith("9 files of another camera beside those of the model, unused: DJI_")
+    assert notes["images_unregistered"] == "1 file not in the model, unused: DJI_20240806173449_0009_T.png"
+
+
 @pytest.mark.parametrize("text", [False, True])
 def test_a_larger_model_beside_is_told(tmp_path, caplog, text):
     """COLMAP numbers models that do not connect in the order in which it began them: sparse/0 need not be the largest."""

@@ -89,6 +89,18 @@ def test_names_of_older_copies_are_matched(tmp_path, form):
     np.testing.assert_allclose(scene.train[1].thermal[..., 0] * 255, grey(2), atol=1e-4)
 
 
+def test_more_than_nine_digits_in_a_row_are_no_time_and_match_no_names(tmp_path, caplog):
+    files = [
+        f"20240806153{i:03d}123.png" for i in range(9)
+    ]  # a date and a time, of which the first nine digits are all the same
+    write_rhd(tmp_path, "s", files, INFO)
+    assert set(loaded(tmp_path, scene="s").train.times_s) == {None} and "20240806153000123" in caplog.text
+    write_colmap(tmp_path / "t" / "thermal", [f"photo-{file}" for file in files], images=None)
+    write_image(tmp_path / "t" / "thermal" / "images" / files[0], grey(0))
+    with pytest.raises(SceneError, match="none of the 9 images of the sparse model"):
+        loaded(tmp_path, scene="t")
+
+
 def test_without_info_the_defaults_are_loud(tmp_path, caplog):
     write_rhd(tmp_path, "s", rhd_names(SECONDS))
     with caplog.at_level(logging.WARNING):

@@ -75,6 +75,17 @@ def test_a_listed_name_is_the_frame_of_that_name_before_one_that_ends_so(tmp_pat
     assert by_list(["left/1.png", "right/1.png"], path) == ([0], [1])
 
 
+@pytest.mark.parametrize(
+    "listed", ["images/2.png", "images\\2.png", "./images/2", "D:\\flight\\images\\2.PNG", "2.jpg"]
+)
+def test_lists_may_have_folders_and_endings_that_the_scene_has_not(tmp_path, listed):
+    path = tmp_path / "test.txt"
+    path.write_text(f"{listed}\n")
+    assert by_list(["1.png", "2.png"], path) == ([0], [1])
+    with pytest.raises(SceneError, match="which is no frame of the scene"):
+        by_list(["1.png", "left/2.png"], path)
+
+
 @pytest.mark.parametrize("listed", ["1.png", "1"])
 def test_a_listed_name_that_several_frames_may_have_is_refused(tmp_path, listed):
     path = tmp_path / "test.txt"

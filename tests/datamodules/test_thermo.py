@@ -197,6 +197,45 @@ def test_poses_may_come_from_colmap(tmp_path):
     assert scene.point_colors is not None and "weather" in scene.metadata
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_labels_and_features_are_those_of_the_points_in_their_file(tmp_path, text):
+    """COLMAP's reader has points in an order of its own."""
+    write_colmap(tmp_path, names(6), text=text, point_count=50)
+    frames = {name: {"utc": 10 * i, "split": "test" if i > 3 else "train"} for i, name in enumerate(names(6))}
+    (tmp_path / "meta.json").write_text(json.dumps({"min_value": 0, "max_value": 50, "frames": frames}))
+    file = tmp_path / "sparse" / "0" / f"points3D.{'txt' if text else 'bin'}"
+    if text:
+        there = np.loadtxt(file, usecols=(1, 2, 3))
+    else:
+        kind = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
+        there = np.frombuffer(file.read_bytes()[8:], kind)["xyz"]
+    np.save(tmp_path / "space_features.npy", there)
+    np.save(tmp_path / "labels.npy", (there[:, 0] > 0).astype(int))
+    scene = loaded(tmp_path)
+    torch.testing.assert_close(scene.point_features, scene.points)
+    assert torch.equal(scene.labels, (scene.points[:, 0] > 0).long())
+
+
+@pytest.mark.parametrize("form", ["{}/{}.png", "{}/{}", "{1}.png", "{1}", "yard/{}/{}.tif"])
+def test_frames_in_meta_may_be_named_with_and_without_folders_and_endings(yard, form):
+    utc = {}
+
+    def move(values):
+        for frame in values["frames"]:
+            utc[form.format(*Path(frame["file_path"]).parts)] = {"utc": frame.pop("utc")}
+
+    before = loaded(yard)
+    for subset in ("train", "test"):
+        change(yard / f"transforms_{subset}.json", move)
+    change(yard / "meta.json", lambda values: values.update(frames=utc))
+    assert len(utc) == FRAMES and loaded(yard).test.times_s == before.test.times_s
+    change(yard / "meta.json", lambda values: values.update(frames={"other.png": {"utc": 0}}))
+    with pytest.raises(
+        SceneError, match="meta.json: 'frames' names none of the scene's frames: other.png is not among"
+    ):
+        loaded(yard)
+
+
 def test_ntr_takes_weather_classes_and_features_that_lie_beside_it(yard):
     """The same folder without UTC is an NTR scene whose frames count seconds."""
     times = dict(zip((f"{i:04d}" for i in range(FRAMES)), recording().times_s.tolist(), strict=True))

@@ -56,6 +56,15 @@ def test_a_column_without_values_counts_as_missing(table):
         (["time_s,air_c", "0,1", "60,warm"], "line 3: 'warm' in column air_c is no number"),
         (["time_s,air_c", "0,1", "60"], "line 3: 1 cells for 2 columns"),
         (["sep=;", "time_s;air_c", "0;1", "60;1,2,3"], "weather.csv, line 4: '1,2,3' in column air_c is no number"),
+        (
+            ["time_s,air_c", "0,1,5", "60,2,5"],
+            "weather.csv, line 2: 3 cells for 2 columns; separate columns by semicolons",
+        ),
+        (
+            ["time,air_c", "1720656000000,1", "1720659600000,2"],
+            "line 2, column time: .* divide milliseconds since 1970 by 1000",
+        ),
+        (["time_s,humidity_percent", "0,0.5", "60,0.6"], "humidity_percent is 0.6 at the most, .* humidity_fraction"),
         (["hour,air_c", "0,1", "1,2"], "no column of times .* it has hour, air_c"),
         (["time_s,snow_cm", "0,1", "1,2"], "none of the columns air_c, wind_m_s, .* it has time_s, snow_cm"),
         (
@@ -213,13 +222,14 @@ def test_recorded_clouds_take_their_share_of_light_that_was_not_measured(table):
     assert "clouds take" in dull.notes["irradiance"] and "clouds" not in clear.notes["irradiance"]
 
 
+@pytest.mark.parametrize("step", [1, -1])
 @pytest.mark.parametrize("minutes", [60, 10])
-def test_an_hour_that_clocks_show_twice_comes_twice(table, minutes):
+def test_an_hour_that_clocks_show_twice_comes_twice(table, minutes, step):
     first_s, step_s = 1729980000.0, 60.0 * minutes  # 2024-10-26, 22:00 UTC; at 1:00 UTC summer time ends in Berlin
     times_s = [first_s + k * step_s for k in range(6 * 60 // minutes)]
     shown = [datetime.fromtimestamp(time_s, ZoneInfo("Europe/Berlin")).replace(tzinfo=None) for time_s in times_s]
     lines = [f"{time.isoformat()},{k}" for k, time in enumerate(shown)]
-    weather = read_weather(table("time,air_c", *lines), zone="Europe/Berlin")
+    weather = read_weather(table("time,air_c", *lines[::step]), zone="Europe/Berlin")
     assert weather.times_s.tolist() == times_s
     assert weather.air_c.tolist() == [*range(len(times_s))]
     assert not {"unsorted", "duplicates"} & weather.notes.keys()

@@ -52,6 +52,8 @@ def test_columns_are_known_by_name_and_unit(table):
         ("GHI (W/m^2)", "7", "irradiance_w_m2", 7.0),
         ("ghi_Wm-2", "7", "irradiance_w_m2", 7.0),
         ("Pressure (mb)", "1013", "pressure_hpa", 1013.0),
+        ("GHI [W m⁻²]", "7", "irradiance_w_m2", 7.0),
+        ("wind [m s⁻¹]", "3", "wind_m_s", 3.0),
     ],
 )
 def test_units_become_ours(table, header, value, name, expected):
@@ -65,6 +67,18 @@ def test_columns_are_separated_in_four_ways(table, delimiter):
     weather = read_weather(table(*(delimiter.join(row) for row in rows)))
     assert weather.times_s[0] == MIDNIGHT_S  # a column called utc needs no zone
     assert weather.air_c.tolist() == [10.5, 11.5]
+
+
+def test_what_stands_before_the_names_of_columns_is_skipped(table):
+    path = table(
+        "latitude,longitude,elevation,timezone",  # as Open-Meteo writes it
+        "50.1,8.7,110.0,GMT",
+        "",
+        "time,temperature_2m (°C),cloud_cover (%)",
+        "2024-07-11T00:00,10.5,0",
+        "2024-07-11T01:00,11.5,0",
+    )
+    assert read_weather(path, zone="UTC").air_c.tolist() == [10.5, 11.5]
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "cp1252", "utf-16"])

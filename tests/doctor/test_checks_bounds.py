@@ -41,6 +41,27 @@ def test_the_remedy_for_another_unit_is_one_that_such_files_have():
         assert helps in remedy and ("data." in remedy) == (posed and stored in ("counts", "grey8"))
 
 
+def test_the_remedy_names_what_gave_the_bounds():
+    of_rhd = replace(clean(), stored="grey8", bounds_in="info.json")
+    wrong = (replace(of_rhd, clipped=0.05), replace(of_rhd, bounds_c=(295.0, 329.0), unit_k=34.0))
+    for found in (findings_of(material, "bounds")[0] for material in wrong):
+        assert "(info.json)" in found.remedy and "data.bounds_c" not in found.remedy
+
+
+def test_floats_that_are_shares_of_a_range_are_found():
+    """As heatsplat reads them, with the bounds that it takes from them, and as a preparation does."""
+    scene = replace(clean(), bounds_c=(0.02, 0.98), unit_k=0.96, bounds_chosen=True, stored="celsius")
+    files = replace(
+        clean(), images=clean().images.clamp(0, 1), bounds_c=None, unit_k=1.0, stored="celsius", cameras=None
+    )
+    for material in (scene, files):
+        (found,) = findings_of(material, "bounds")
+        assert "may be shares of a range" in found.what and "counts.scale=SPAN counts.offset_c=MIN" in found.remedy
+        assert ("prepare.py" in found.remedy) is (material is scene)
+    assert findings_of(replace(scene, bounds_c=(-0.4, 0.9), unit_k=1.3), "bounds") == []
+    assert findings_of(replace(scene, bounds_chosen=False), "bounds") == []
+
+
 def test_greys_that_are_kelvin_x_100_are_found():
     def greys(low: float, high: float, stored: str = "grey16") -> list[str]:
         """What is found of 16-bit greys between two counts."""

@@ -11,6 +11,8 @@ def test_pixels_that_never_follow_the_scene_are_found_where_they_are():
     images[:, 3, 4], images[:, 20, 30], images[:, 40, 9] = 1.0, 0.0, 1.0
     found = find(changed(clean(), images))
     assert found[0].what.startswith("3 pixels") and "(4, 3)" in found[0].what and "(30, 20)" in found[0].what
+    height, width = images.shape[1:]
+    assert found[0].what.endswith(f"in images of {width}x{height}.")
     assert find(clean()) == []
 
 

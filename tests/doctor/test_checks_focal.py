@@ -28,6 +28,7 @@ def test_a_wrong_focal_length_is_found_and_the_true_one_named(scene, factor):
     bad = wrong(clean(scene), factor)
     assert "focal" in checks(bad, only="focal")
     assert factor * fitting_factor(bad)[0] == pytest.approx(1.0, abs=0.04)
+    assert f"of the cameras (in images of {bad.cameras[0].width}x{bad.cameras[0].height})" in find(bad)[0].what
     assert not find(clean(scene))
 
 

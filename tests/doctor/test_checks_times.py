@@ -33,6 +33,8 @@ def test_a_second_camera_that_began_earlier_is_no_clock_that_runs_back():
     of_two = replace(clean(), times_s=[10.0 * i if i < 8 else 10.0 * i - 75 for i in range(count)])
     assert find(of_two)
     assert not find(replace(of_two, lenses=[int(i >= 8) for i in range(count)]))
+    in_folders = [f"{'left' if i < 8 else 'right'}/{name}" for i, name in enumerate(of_two.names)]
+    assert not find(replace(of_two, names=in_folders))
 
 
 def test_gaps_are_told_in_the_unit_that_people_would_take():
@@ -49,3 +51,5 @@ def test_cameras_that_are_triggered_together_repeat_no_time():
     together = replace(clean(), times_s=[10.0 * (i // 2) for i in range(count)])
     assert any("have the time of another one" in one.what for one in find(together))
     assert not any("another one" in one.what for one in find(replace(together, lenses=[i % 2 for i in range(count)])))
+    in_folders = [f"{i % 2}/{name}" for i, name in enumerate(together.names)]
+    assert not any("another one" in one.what for one in find(replace(together, names=in_folders)))

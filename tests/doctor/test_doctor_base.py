@@ -15,6 +15,13 @@ def test_the_material_has_the_training_views_with_their_unit_and_names():
     assert material.unit_k == scene.thermal_range.span_k and material.name(3) == material.names[material.chosen[3]]
     torch.testing.assert_close(material.image(2), scene.train[2].thermal[..., 0].double())
     assert 0 < material.noise < material.contrast
+    for source in (
+        "info.json",
+        "data.min_c and data.max_c: the data set keeps them in its code",
+        "info.json (swapped)",
+    ):
+        told = material_of(replace(scene, notes=scene.notes | {"bounds_source": source})).bounds_in
+        assert told == ("info.json" if "info" in source else "data.min_c and data.max_c")
 
 
 def test_what_a_mask_leaves_out_and_what_is_unknown_do_not_count():
@@ -25,6 +32,15 @@ def test_what_a_mask_leaves_out_and_what_is_unknown_do_not_count():
     material = Material(["a"], None, [0], images, masks=masks)
     assert material.known(0).tolist() == [float(i) for i in range(1, 11)]
     assert material.size(0.5) == "50 % of the range" and replace(material, unit_k=4.0).size(0.5) == "2 K"
+
+
+def test_frames_of_which_nothing_counts_leave_the_contrast_as_it_is():
+    scene = Synthetic(scene="static", size="tiny").scene
+    material = material_of(scene)
+    masks = torch.ones(material.images.shape, dtype=torch.bool)
+    masks[2] = False
+    assert abs(replace(material, masks=masks).contrast / material.contrast - 1.0) < 0.1
+    assert replace(material, masks=masks & False).contrast > 0
 
 
 def test_of_photos_only_a_coarse_brightness_is_kept():

@@ -67,6 +67,7 @@ class Material:
         points: [P, 3] of the scene, or None where there are none but random ones.
         bounds_c: temperatures of image values 0 and 1, or None.
         bounds_chosen: whether heatsplat took these bounds from the training images, as nobody gave any.
+        bounds_in: what gave them, such as a file; "" where that is not known.
         stored: what the image files hold: "celsius" (floating point), "radiometric", "counts", "grey8" or "grey16"; "" where
             unknown.
         clipped: share of pixels that lay outside the bounds, or None where unknown.
@@ -91,6 +92,7 @@ class Material:
     points: Tensor | None = None
     bounds_c: tuple[float, float] | None = None
     bounds_chosen: bool = False
+    bounds_in: str = ""
     stored: str = ""
     clipped: float | None = None
     answers: Tensor | None = None
@@ -114,10 +116,8 @@ class Material:
     @cached_property
     def contrast(self) -> float:
         """Standard deviation of what the images show."""
-        spread = (
-            torch.stack([self.known(f).std() for f in range(len(self.images))]) if len(self.images) else torch.zeros(1)
-        )
-        return max(float(spread.median()), self.noise, 1e-9)
+        spread = [known.std() for f in range(len(self.images)) if len(known := self.known(f)) > 1]
+        return max(float(torch.stack(spread).median()) if spread else 0.0, self.noise, 1e-9)
 
     @cached_property
     def tracks(self) -> Tracks | None:
@@ -181,6 +181,11 @@ class Material:
         """Name of a frame of ``images``."""
         return self.names[self.chosen[frame]]
 
+    @property
+    def grid(self) -> str:
+        """Width and height of the images, which need not be those of the files (data.downscale)."""
+        return "x".join(map(str, self.images.shape[:0:-1]))
+
     def size(self, value: float) -> str:
         """A difference of values in words."""
         return f"{100 * value:.2g} % of the range" if self.unit_k is None else f"{value * self.unit_k:.2g} K"
@@ -228,6 +233,7 @@ def material_of(scene: SceneData) -> Material:
         points=points,
         bounds_c=None if bounds is None else (bounds.min_c, bounds.max_c),
         bounds_chosen="training_images_c" in scene.notes,
+        bounds_in=str(scene.notes.get("bounds_source", "")).partition(":")[0].partition(" (")[0],
         stored=_stored(scene),
         clipped=scene.notes.get("clipped_fraction"),
         answers=drivers(scene.weather, seen_s, air=(QUICK_PER_S, SLOW_PER_S)),

@@ -14,7 +14,7 @@ EARTHLY_C = (-60.0, 650.0)  # what cameras measure without a special range
 MAX_VALUES = 1 << 23  # torch takes no quantiles of twice as many
 FULL_16_BIT = 65535
 PLATEAU = 0.004  # share of an image's pixels at exactly its largest value
-WIDER = "Give wider bounds (data.bounds_c, temperature_bounds.json), from the same export as the images."
+BOUNDS_IN = "data.bounds_c or temperature_bounds.json"  # where bounds stand, unless the scene says it
 MIN_PLATEAU = 8  # pixels: one always is the largest, and in a small image it is a large share
 
 
@@ -40,11 +40,15 @@ def find(material: Material) -> list[Finding]:
         where = f"In {len(flat)} of {len(material.images)} frames {100 * share:.1f} % of the pixels"
         if material.bounds_c is not None and all(at_bound[f] for f in flat):
             what = f"{where} lie at or beyond the upper bound {material.bounds_c[1]:g} °C and are cut off."
-            found.append(Finding("bounds", cost, what, WIDER, names))
+            found.append(Finding("bounds", cost, what, _wider(material), names))
         else:
             remedy = "The detector or the export saturates: record in the high range, or mask what is hotter."
             found.append(Finding("saturation", cost, f"{where} have the largest value.", remedy, names))
     return found
+
+
+def _wider(material: Material) -> str:
+    return f"Give wider bounds ({material.bounds_in or BOUNDS_IN}), from the same export as the images."
 
 
 def _cut_off(material: Material, values: torch.Tensor) -> list[Finding]:
@@ -58,7 +62,7 @@ def _cut_off(material: Material, values: torch.Tensor) -> list[Finding]:
         return []
     low, high = material.bounds_c
     what = f"{100 * clipped:.1f} % of the pixels lie at or beyond the bounds {low:g} .. {high:g} °C"
-    remedy = WIDER
+    remedy = _wider(material)
     if material.bounds_chosen:
         what += ", which heatsplat took from the training images without dead pixels,"
         remedy = (
@@ -102,6 +106,9 @@ def _of_unit(material: Material, values: torch.Tensor) -> list[Finding]:
         kelvin = f"kelvin of {low - KELVIN_AT_0_C:.4g} .. {high - KELVIN_AT_0_C:.4g} °C"
         what = f"All pixels lie within {low:.4g} .. {high:.4g} °C, which may be {kelvin}."
         return [Finding("bounds", 0.9, what, remedy)]
+    if not given and material.stored == "celsius" and 0.0 <= low < high <= 1.0:
+        what = f"All pixels lie within {low:.3g} .. {high:.3g} °C, which may be shares of a range rather than temperatures."
+        return [Finding("bounds", 0.9, what, _shares_remedy(material))]
     if not given:  # a cold sky or a flame may be in view, but no scene consists of them
         low = high = _celsius(material, values.median()[None])[0]
     if low < EARTHLY_C[0] or high > EARTHLY_C[1]:
@@ -138,8 +145,16 @@ def _unit_remedy(material: Material) -> str:
         return "Check the constants of the files: python src/prepare.py takes others as counts.planck=[R1,B,F,O,R2]."
     if material.stored in ("celsius", "counts"):
         return "Check the unit: °C = counts.scale * number + counts.offset_c (-273.15 for kelvin)."
-    bounds = "data.bounds_c or temperature_bounds.json" if posed else "bounds_c or temperature_bounds.json"
-    return f"Check the unit of the bounds: {bounds} are the °C of black and white."
+    bounds = material.bounds_in or (BOUNDS_IN if posed else "bounds_c or temperature_bounds.json")
+    return f"Check the unit of the bounds ({bounds}): they are the °C of black and white."
+
+
+def _shares_remedy(material: Material) -> str:
+    """What makes temperatures of floats from 0 to 1."""
+    command = "counts.scale=SPAN counts.offset_c=MIN"
+    if material.cameras is not None:
+        command = f"python src/prepare.py source=IMAGES target=FOLDER {command} poses=given poses.model=SCENE"
+    return f"If they are: {command}, of the range that 0 and 1 stand for in °C."
 
 
 def _counts_as_greys(material: Material, values: torch.Tensor) -> list[Finding]:

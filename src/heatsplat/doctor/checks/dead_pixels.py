@@ -26,7 +26,8 @@ def find(material: Material) -> list[Finding]:
         Finding(
             "dead_pixels",
             min(1.0, 20.0 * share) + 0.01,
-            f"{count} pixels differ from what is around them in nearly all frames, such as (x, y) = {first}.",
+            f"{count} pixels differ from what is around them in nearly all frames, such as (x, y) = {first} in images of "
+            f"{material.grid}.",
             "Leave them out with masks/<image name>.png (black where a pixel is dead); python src/prepare.py writes such masks.",
         )
     ]

@@ -31,6 +31,8 @@ def find(material: Material) -> list[Finding]:
     if material.answers is None:  # under one weather surfaces rise and fall in common
         looks.append((*followed, _in_common))
     for values, weights, drifts in looks:
+        if (weights > 0).any(1).sum() < 2:  # no halves
+            continue
         levels = frame_levels(values, weights)
         before, after = _spread(values, weights, torch.zeros_like(levels)), _spread(values, weights, levels)
         if after < LEFT * before and drifts(material, values, weights, levels):
@@ -92,10 +94,11 @@ def _halves(shown: Tensor, values: Tensor, weights: Tensor) -> list[list[Tensor]
     some, count = used.any(1), used.sum(1).clamp_min(1)
     mean = (shown * used).sum(1) / count
     change = (((shown - mean[:, None]) * used).square().sum(1) / count).sqrt()
-    halves = []
+    seen, halves = some.nonzero()[:, 0], []
     for order in (change, mean):
-        upper = order > order[some].median()
-        halves.append([frame_levels(values[keep], weights[keep]) for keep in (upper & some, ~upper & some)])
+        ranked = seen[order[seen].argsort(stable=True)]  # points that change alike are in either half
+        middle = (len(ranked) + 1) // 2
+        halves.append([frame_levels(values[keep], weights[keep]) for keep in (ranked[middle:], ranked[:middle])])
     return halves
 
 

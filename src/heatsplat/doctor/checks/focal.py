@@ -42,8 +42,9 @@ def find(material: Material) -> list[Finding]:
             "focal",
             (before**2 - after**2) ** 0.5 / material.contrast,
             f"The images fit poses and points best with a focal length of {factor * focal:.4g} pixels, which is "
-            f"{abs(100 * (factor - 1)):.0f} % {'more' if factor > 1 else 'less'} than the {focal:.4g} of the cameras; a point "
-            f"then differs between frames by {material.size(after)}, and by {material.size(before)} with theirs.",
+            f"{abs(100 * (factor - 1)):.0f} % {'more' if factor > 1 else 'less'} than the {focal:.4g} of the cameras (in images "
+            f"of {material.grid}); a point then differs between frames by {material.size(after)}, and by "
+            f"{material.size(before)} with theirs.",
             "Check fl_x or the cameras' parameters: the image size that they are for, and the pitch of pixels.",
         )
     ]

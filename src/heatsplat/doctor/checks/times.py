@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import PurePosixPath
 
 import torch
 
@@ -17,13 +18,16 @@ def find(material: Material) -> list[Finding]:
         return []
     times = torch.tensor([float(t) for t in material.times_s], dtype=torch.float64)
     found = []
-    lens = material.lenses or [0] * len(times)
-    # Each camera has names of its own.
-    by_name = sorted(range(len(times)), key=lambda i: (lens[i], by_numbers(material.names[i])))
+    # Each camera, told by its lens or by its folder, has names of its own.
+    own: dict[object, list[int]] = {}
+    for i, name in enumerate(material.names):
+        own.setdefault((material.lenses[i] if material.lenses else 0, PurePosixPath(name).parent), []).append(i)
+    by_name = [sorted(frames, key=lambda i: by_numbers(material.names[i])) for frames in own.values()]
     back = [
         material.names[after]
-        for before, after in pairwise(by_name)
-        if lens[before] == lens[after] and times[after] < times[before]
+        for frames in by_name
+        for before, after in pairwise(frames)
+        if times[after] < times[before]
     ]
     if 0 < len(back) < 0.2 * len(times):
         found.append(
@@ -36,8 +40,8 @@ def find(material: Material) -> list[Finding]:
             )
         )
     steps = times.sort().values.diff()
-    of_lens = [times[[i for i in range(len(times)) if lens[i] == number]] for number in sorted(set(lens))]
-    same = sum(int((own.sort().values.diff() == 0).sum()) for own in of_lens)  # cameras may be triggered together
+    # Cameras may be triggered together.
+    same = sum(int((times[frames].sort().values.diff() == 0).sum()) for frames in own.values())
     if same > 0.05 * len(steps):
         found.append(
             Finding(
