@@ -368,7 +368,7 @@ class SplatTraining(SceneModel):
         here = self.schedule.round_step(step)
         if self.optim.decoupled is not None and update:
             self.optim.decoupled(inner, here, self._pixels, self.scene.extent)
-        self.overlap.shrink(cloud, here)
+        shrunk = self.overlap.shrink(cloud, here)
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)
         before = len(self.splats)
@@ -381,8 +381,9 @@ class SplatTraining(SceneModel):
             )
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         self.surroundings.after_step(step, self.splats, self.composited)
-        if change is not None:
+        if change is not None or shrunk:
             self._average.forget()
+        if change is not None:
             for group in inner.param_groups:
                 if group["name"] in self._declared:
                     group |= penalties(self._declared[group["name"]], len(self.splats))
