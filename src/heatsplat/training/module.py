@@ -371,7 +371,7 @@ class SplatTraining(SceneModel):
         shrunk = self.overlap.shrink(cloud, here)
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)
-        before = len(self.splats)
+        before, centres = len(self.splats), self.splats.means
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
         self._check_change(change, len(self.splats) - before)
         self.density_change = change
@@ -379,6 +379,8 @@ class SplatTraining(SceneModel):
             raise SceneError(
                 f"{type(self.density).__name__} removed all Gaussians in step {step + 1}: give it milder thresholds"
             )
+        if self.splats.means is not centres:
+            self.thermal.on_rows_changed()
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         self.surroundings.after_step(step, self.splats, self.composited)
         if change is not None or shrunk:
