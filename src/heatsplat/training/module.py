@@ -17,9 +17,8 @@ from torch import Tensor, nn
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
 from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
-from heatsplat.geometry.resampling import resampled
 from heatsplat.io.results import RunResults
-from heatsplat.losses.compose import Loss, LossInputs, pixel_errors, summands
+from heatsplat.losses.compose import Loss, LossInputs, known_target, pixel_errors, summands
 from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
@@ -323,11 +322,7 @@ class SplatTraining(SceneModel):
         self._rendered = (output, camera)
         loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
-            target = inputs.target
-            if inputs.mask is not None and target.shape[:2] == (camera.height, camera.width):
-                target = target.where(inputs.mask[..., None], torch.nan)
-            target = resampled(target, camera.height, camera.width, "area")
-            maps = self.density.pixel_maps(pixel_errors(inputs, camera), target, here)
+            maps = self.density.pixel_maps(pixel_errors(inputs, camera), known_target(inputs, camera), here)
             loss = loss + (output.weighted.image * maps).sum() * ratio**2
         told = {name: term.detach() for name, term in terms.items()}
         return {"loss": loss, "terms": told, "prediction": prediction.detach()}
