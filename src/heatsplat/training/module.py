@@ -121,7 +121,7 @@ class SplatTraining(SceneModel):
         self._density_state: dict[str, Tensor] = {}
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
-        self._pixels = 0  # of the last image
+        self._pixels = 0  # of the last target
         self._checked_trained = False  # after the first step, which may make parameters
         self._average = Average()
         self._averaged = thermal.averaged if optim.averaged is None else optim.averaged
@@ -319,7 +319,7 @@ class SplatTraining(SceneModel):
             self.cameras.regularisers(),
         )
         terms = summands(self.loss(inputs), *regularisers, entropy)
-        self._rendered = (output, camera)
+        self._rendered, self._pixels = (output, camera), inputs.target[..., 0].numel()
         loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
             maps = self.density.pixel_maps(pixel_errors(inputs, camera), known_target(inputs, camera), here)
@@ -329,7 +329,6 @@ class SplatTraining(SceneModel):
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
-        self._pixels = camera.width * camera.height
         self.density.observe(self._density_state, output, camera, self.schedule.round_step(self.global_step))
         self._rendered = None
 
