@@ -85,15 +85,19 @@ def test_images_without_region_of_interest_are_not_averaged_in(tmp_path):
 
 
 def test_black_images_are_counted_and_said(tmp_path, caplog):
+    """By the pixels that count: a hot one under the mask makes no picture, and an image that is masked all over is none."""
     scene = wall()
 
     def decode(i):
         view = scene.test[i]
-        return replace(view, thermal=torch.zeros_like(view.thermal)) if i else view
+        mask = torch.full(view.thermal.shape[:2], i < 3)
+        mask[0, 0] = False
+        dead = torch.where(mask[..., None], 0.0, 1.0)
+        return replace(view, thermal=dead, mask=mask) if i else view
 
     results = scored(replace(scene, test=ViewSet(scene.test.frames, decode)), tmp_path)
-    assert results.data["test_images_of_one_value"] == 3
-    assert "3 of 4 test images have one value everywhere" in caplog.text
+    assert results.data["test_images_of_one_value"] == 2
+    assert "2 of 4 test images have one value everywhere" in caplog.text
     assert "test_images_of_one_value" not in scored(scene, tmp_path).data
 
 

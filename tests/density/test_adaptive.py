@@ -124,8 +124,9 @@ def test_without_resets_opacities_and_large_gaussians_stay():
     assert len(cloud) == 2 and cloud.splats.opacities[0].tolist() == pytest.approx([0.9, 0.9])
     with pytest.raises(ValueError, match="reset_every and cap_max must be at least 1"):
         Adaptive(reset_every=0)
-    with pytest.raises(ValueError, match="density.multiple must be above 0"):
-        Adaptive(multiple=0)
+    for multiple in (0, float("inf")):
+        with pytest.raises(ValueError, match="density.multiple must be above 0 and finite"):
+            Adaptive(multiple=multiple)
 
 
 @pytest.mark.parametrize("wrong", [0, 1, -1])

@@ -344,6 +344,8 @@ def test_transparent_are_removed_at_events_and_an_empty_cloud_is_an_error():
     "options",
     [
         {"every": 0},
+        {"multiple": float("inf")},
+        {"cap_max": float("inf"), "multiple": None},
         {"keep": 0.0},
         {"floor": -1.0},
         {"curve": "steep"},

@@ -7,6 +7,7 @@ import torch
 from helpers import OF_GAUSSIANS
 from running import BARE, QUIET, run
 
+from heatsplat.thermal.static import Static
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.module import CHECKPOINT_KEY, SplatTraining
 
@@ -129,6 +130,15 @@ def test_opacities_are_reset_while_they_are_trained(method, more, resets, tmp_pa
     given = (*BARE, "density=adaptive", *every, "max_steps=40")
     run(tmp_path, *given, f"method={method}", *more)
     assert steps == resets
+
+
+def test_models_are_told_where_as_many_gaussians_come_as_go(tmp_path, monkeypatch):
+    steps, numbers = [], []
+    monkeypatch.setattr(Static, "on_rows_changed", lambda self: steps.append(len(numbers)))
+    monkeypatch.setattr(SplatTraining, "on_after_backward", lambda self: numbers.append(len(self.splats)))
+    given = (*BARE, "method=3dgs", "density=mcmc", *RULES["mcmc"], *BRIEF["mcmc"], "max_steps=10", "cap_max=600")
+    run(tmp_path, *given, "density.dead_opacity=0.6")
+    assert steps == [4, 8] and set(numbers) == {600}
 
 
 PAIRS = [  # every method of Gaussians under one of the rules; under the others where there is time

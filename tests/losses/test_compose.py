@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from heatsplat.composition import build, compose
+from heatsplat.contracts import Camera
 from heatsplat.losses import schedules
-from heatsplat.losses.compose import During, Loss, LossInputs, LossTerm, Weighted, summands
+from heatsplat.losses.compose import During, Loss, LossInputs, LossTerm, Weighted, known_target, pixel_errors, summands
 from heatsplat.losses.low_resolution import OnTargetGrid
 from heatsplat.losses.modality_balance import ByOthersShare
 from heatsplat.losses.photometric import Photometric
@@ -32,6 +33,19 @@ class Never(LossTerm):
 
 
 mean = Mean()
+
+
+@pytest.mark.parametrize("finer", [1, 2])
+def test_density_control_is_told_of_no_masked_pixel(finer):
+    """Of a finer render either, where what stands in masked pixels was taken for the scene."""
+    camera = Camera(torch.eye(4), torch.eye(3), 3 * finer, 2 * finer)
+    mask = torch.tensor([[True, False, True], [True, True, False]])
+    target = torch.where(mask, 0.25, 7.0)[..., None]
+    inputs = LossInputs(torch.full((2 * finer, 3 * finer, 1), 0.5), target, mask, view=None, splats=None)
+    counts = mask.repeat_interleave(finer, 0).repeat_interleave(finer, 1)
+    found = known_target(inputs, camera)[..., 0]
+    assert torch.equal(~found.isnan(), counts) and torch.allclose(found[counts], torch.tensor(0.25))
+    assert torch.allclose(pixel_errors(inputs, camera), torch.where(counts, 0.25, 0.0))
 
 
 def test_names_join_term_and_part():

@@ -49,3 +49,9 @@ def test_gain_control_of_images_in_between_is_asked_for(known):
         assert seen.mean().item() == pytest.approx(0.3, abs=1e-6) and (first - 0.3) * (second - 0.3) < 0
         late = part(image, Frame("other.png", 1, CAMERA, 9.0)).mean().item()
         assert abs(late - second) < abs(0.3 - second)
+
+
+def test_a_view_that_no_one_took_is_in_the_middle_where_there_are_no_times():
+    part, _ = gain_control([None] * 3)
+    untaken, middle = Frame("orbit_0000.png", 7, CAMERA), Frame("3.png", 3, CAMERA)
+    assert part.at(torch.arange(3.0), untaken) == part.at(torch.arange(3.0), middle) == 1.0

@@ -9,6 +9,7 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet
+from heatsplat.density.ops import Cloud
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.splats import Splats
 from heatsplat.thermal import conduction
@@ -518,3 +519,15 @@ def test_the_graph_is_drawn_anew_when_gaussians_change_and_at_stated_steps():
     assert not torch.equal(model.edges, first)
     fewer = Splats({name: splats[name][:30] for name in splats.names})
     assert model.features(fewer, query()).shape == (30, 1) and model.edges.max() < 30
+
+
+def test_heat_flows_between_neighbours_where_as_many_gaussians_came_as_went():
+    model, splats = conducting()
+    model.features(splats, query())
+    cloud = Cloud(splats)
+    rows = cloud.rows(torch.tensor([39]))
+    cloud.keep(torch.arange(40) > 0)
+    cloud.append(rows)
+    model.on_rows_changed()
+    fresh, _ = conducting()
+    assert torch.equal(model.features(splats, query()), fresh.features(splats, query()))

@@ -65,6 +65,9 @@ class Probe(ThermalModel):
     def on_step(self, step):
         self.told.append(step)
 
+    def on_rows_changed(self):
+        self.told.append("rows")
+
     def per_gaussian(self, seeds):
         return {"probe": PerGaussian(seeds.values.clone(), 0.77, l2=0.66, lr_end=0.55)}
 
@@ -262,7 +265,8 @@ def test_a_field_over_time_holds_its_ends_beyond_the_record(build, beyond_s, nea
 def test_what_the_model_inside_is_told_comes_in(wrapped):
     wrapped.model.on_step(17)
     wrapped.model.features(wrapped.splats, QUERY)
-    assert wrapped.probe.told == ["check", "prepare", 17, "features"]
+    wrapped.model.on_rows_changed()
+    assert wrapped.probe.told == ["check", "prepare", 17, "features", "rows"]
 
 
 def test_tensors_and_parameters_keep_their_rates_and_penalties(wrapped):

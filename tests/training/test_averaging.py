@@ -119,3 +119,10 @@ def test_a_share_is_from_0_to_1(tmp_path):
             Optimisation(**options)
     with pytest.raises(Exception, match="optim.averaged is a share of the run, from 0 to 1, or null, got 2"):
         run(tmp_path, *TAIL, "method=3dgs", "optim.averaged=2")
+
+
+def test_sizes_before_a_reset_are_no_part_of_the_mean(tmp_path):
+    short = (*BARE, "method=3dgs", "density=fixed", "max_steps=20", "optim.accumulate=1", "optim.averaged=0.5")
+    resets = ("overlap=short_lists", "overlap.entropy=0", "overlap.reset_every=14", "overlap.reset_start=0")
+    module, _ = run(tmp_path, *short, *resets, "overlap.reset_stop=20")
+    assert module.results.run["averaged_updates"] == 7  # after steps 13 to 19, the first of which resets

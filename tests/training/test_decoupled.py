@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from running import BARE, run
 
 from heatsplat.splats import Splats
 from heatsplat.training.decoupled import DecoupledDecay
@@ -78,3 +79,12 @@ def test_a_negative_rate_is_refused():
         DecoupledDecay(opacity=-math.inf)
     with pytest.raises(ValueError, match="stop are steps of 0 or more, got 3000, 1000 and -1"):
         DecoupledDecay(stop=-1)
+
+
+def test_a_finer_render_counts_the_pixels_of_the_training_image(tmp_path, monkeypatch):
+    """Over which its loss is a mean."""
+    counted = []
+    monkeypatch.setattr(DecoupledDecay, "__call__", lambda self, *given: counted.append(given[2]))
+    module, _ = run(tmp_path, *BARE, "method=direct_3dgs", "density=fixed", "optim=adamw", "max_steps=1")
+    camera = module.scene.train.frames[0].camera
+    assert module.supersample > 1 and counted == [camera.width * camera.height]

@@ -95,7 +95,8 @@ class QualityMetrics(pl.Callback):
         row = {"name": frame.name, "frame_id": frame.frame_id, "time_s": frame.time_s, "seconds": outputs["seconds"]}
         target = view.image(module.modality)
         row |= self._scorer(prediction, target, view.mask)
-        self._empty += bool((target == target.flatten()[0]).all())
+        counted = target if view.mask is None else target[view.mask]
+        self._empty += counted.numel() > 0 and bool((counted == counted.flatten()[0]).all())
         companions = outputs.get("companions", {})
         for modality, image in companions.items():
             scorer = self._scorer if modality == "clean" else self._image_scorer

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -59,8 +61,8 @@ class Adaptive(DensityControl):
             raise ValueError(
                 f"density.every, reset_every and cap_max must be at least 1, got {every}, {reset_every}, {cap_max}"
             )
-        if multiple is not None and not multiple > 0:
-            raise ValueError(f"density.multiple must be above 0, or null, got {multiple}")
+        if multiple is not None and not 0 < multiple < math.inf:
+            raise ValueError(f"density.multiple must be above 0 and finite, or null, got {multiple}")
         if not 0 < reset_opacity < 1:
             raise ValueError(f"density.reset_opacity must lie in (0, 1), got {reset_opacity}")
         if min(start, stop, grad_threshold, duplicate_scale, prune_opacity, prune_scale) < 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -104,9 +105,14 @@ class Budget(DensityControl):
         check_option("density.curve", curve, CURVES)
         if min(every, cap_max, views) < 1:
             raise ValueError(f"density.every, cap_max and views must be at least 1, got {every}, {cap_max} and {views}")
-        if (multiple is not None and not multiple > 0) or least < 0:
+        if (multiple is not None and not 0 < multiple < math.inf) or least < 0:
             raise ValueError(
-                f"density.multiple must be above 0, or null, and least not negative, got {multiple} and {least}"
+                "density.multiple must be above 0 and finite, or null, and least not negative, got "
+                f"{multiple} and {least}"
+            )
+        if multiple is None and math.isinf(cap_max):
+            raise ValueError(
+                "density=budget grows to a number that cap_max=inf with density.multiple=null leaves open: give one of them"
             )
         if not 0 < keep <= 1 or min(floor, least_pixels, noise or 0.0) < 0:
             raise ValueError(

@@ -90,6 +90,16 @@ def pixel_errors(inputs: LossInputs, camera: Camera) -> Tensor:
     return resampled(error[..., None], camera.height, camera.width, "area")[..., 0]
 
 
+@torch.no_grad()
+def known_target(inputs: LossInputs, camera: Camera) -> Tensor:
+    """The target on the grid of ``camera``, its own or one finer by a whole factor, [H, W, C]; NaN where the mask is False."""
+    height, width = camera.height, camera.width
+    target = resampled(cleared(inputs.target, inputs.mask), height, width, "area")
+    if inputs.mask is None:
+        return target
+    return target.where(resampled(inputs.mask[..., None].to(target), height, width, "area") > 0.5, torch.nan)
+
+
 class LossTerm(ABC):
     """One way to compare: from the inputs to one weighted scalar, or to several by name. An empty dict is no term.
 

@@ -13,7 +13,7 @@ class PerFrame(SensorPart):
     """A part with settings for each training image, kept in order of time (of frame number where there is no time).
 
     An image that was not trained on lies between its two neighbours in that order; beyond the first and the last it is
-    where they are.
+    where they are. A view that no one took has no number, and without a time it is in the middle of the record.
     """
 
     def __init__(self) -> None:
@@ -21,9 +21,11 @@ class PerFrame(SensorPart):
         self.register_buffer("moments", torch.zeros(0, dtype=torch.float64))  # of the training images, increasing
         self.register_buffer("frame_ids", torch.zeros(0, dtype=torch.int64))  # in the same order
         self.register_buffer("timed", torch.tensor(True))
+        self._last_number = 0  # of the frames of the scene; views that no one took have higher ones
 
     def prepare(self, scene: SceneData, modality: str = "thermal") -> None:
         self.timed.fill_("time" in scene.metadata)
+        self._last_number = max(frame.frame_id for frame in scene.frames)
         frames = sorted(scene.train.frames, key=lambda frame: (self._moment(frame), frame.frame_id))
         self.moments = torch.tensor([self._moment(frame) for frame in frames], dtype=torch.float64)
         self.frame_ids = torch.tensor([frame.frame_id for frame in frames])
@@ -39,7 +41,8 @@ class PerFrame(SensorPart):
 
     def _moment(self, frame: Frame) -> float:
         """What orders images: their time, or their number. In the middle of the record for a view without."""
-        moment = frame.time_s if self.timed else frame.frame_id
+        number = frame.frame_id if frame.frame_id <= self._last_number else None
+        moment = frame.time_s if self.timed else number
         if moment is not None:
             return float(moment)
         return float(self.moments[0] + self.moments[-1]) / 2

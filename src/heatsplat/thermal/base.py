@@ -200,6 +200,10 @@ class Heat(nn.Module, ABC):
         """Told the training step before it runs, for schedules such as the degree of spherical harmonics."""
         return
 
+    def on_rows_changed(self) -> None:
+        """Told after Gaussians came, went or changed their numbers: what is kept by number belongs to others now."""
+        return
+
     def regularisers(self, splats: Splats) -> dict[str, Tensor]:
         """Extra loss terms by name, each a weighted scalar with a gradient. Penalties x² belong in PerGaussian.l2."""
         return {}

@@ -41,7 +41,7 @@ class Conducting(Wrapper):
     Args:
         state: temperatures without conduction.
         neighbours: of a Gaussian.
-        every: steps after which the graph is drawn anew; also when the number of Gaussians has changed.
+        every: steps after which the graph is drawn anew; also when Gaussians have come or gone.
         flow: κ at the start, per span; positive.
         lr, lr_end: learning rate of log κ and the factor on it at the end of the run.
 
@@ -81,6 +81,10 @@ class Conducting(Wrapper):
     def on_step(self, step: int) -> None:
         super().on_step(step)
         self._due = self._due or step % self.every == 0
+
+    def on_rows_changed(self) -> None:
+        super().on_rows_changed()
+        self.joined.zero_()  # as many may have come as went
 
     def features(self, splats: Splats, query: Query) -> Tensor:
         return query.rows(super().features(splats, replace(query, ids=None)))

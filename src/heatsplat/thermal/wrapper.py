@@ -144,6 +144,10 @@ class Wrapper(ThermalModel):
         for member in self.members.values():
             member.on_step(step)
 
+    def on_rows_changed(self) -> None:
+        for member in self.members.values():
+            member.on_rows_changed()
+
     def regularisers(self, splats: Splats) -> dict[str, Tensor]:
         """Those of all members.
 

@@ -17,9 +17,8 @@ from torch import Tensor, nn
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
 from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
-from heatsplat.geometry.resampling import resampled
 from heatsplat.io.results import RunResults
-from heatsplat.losses.compose import Loss, LossInputs, pixel_errors, summands
+from heatsplat.losses.compose import Loss, LossInputs, known_target, pixel_errors, summands
 from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
 from heatsplat.sensors.base import Composite, SensorChain
@@ -122,7 +121,7 @@ class SplatTraining(SceneModel):
         self._density_state: dict[str, Tensor] = {}
         self.density_change: DensityChange | None = None
         self._rendered: tuple[RenderOutput, Camera] | None = None
-        self._pixels = 0  # of the last image
+        self._pixels = 0  # of the last target
         self._checked_trained = False  # after the first step, which may make parameters
         self._average = Average()
         self._averaged = thermal.averaged if optim.averaged is None else optim.averaged
@@ -320,21 +319,16 @@ class SplatTraining(SceneModel):
             self.cameras.regularisers(),
         )
         terms = summands(self.loss(inputs), *regularisers, entropy)
-        self._rendered = (output, camera)
+        self._rendered, self._pixels = (output, camera), inputs.target[..., 0].numel()
         loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
-            target = inputs.target
-            if inputs.mask is not None and target.shape[:2] == (camera.height, camera.width):
-                target = target.where(inputs.mask[..., None], torch.nan)
-            target = resampled(target, camera.height, camera.width, "area")
-            maps = self.density.pixel_maps(pixel_errors(inputs, camera), target, here)
+            maps = self.density.pixel_maps(pixel_errors(inputs, camera), known_target(inputs, camera), here)
             loss = loss + (output.weighted.image * maps).sum() * ratio**2
         told = {name: term.detach() for name, term in terms.items()}
         return {"loss": loss, "terms": told, "prediction": prediction.detach()}
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
-        self._pixels = camera.width * camera.height
         self.density.observe(self._density_state, output, camera, self.schedule.round_step(self.global_step))
         self._rendered = None
 
@@ -368,10 +362,10 @@ class SplatTraining(SceneModel):
         here = self.schedule.round_step(step)
         if self.optim.decoupled is not None and update:
             self.optim.decoupled(inner, here, self._pixels, self.scene.extent)
-        self.overlap.shrink(cloud, here)
+        shrunk = self.overlap.shrink(cloud, here)
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)
-        before = len(self.splats)
+        before, centres = len(self.splats), self.splats.means
         change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
         self._check_change(change, len(self.splats) - before)
         self.density_change = change
@@ -379,10 +373,13 @@ class SplatTraining(SceneModel):
             raise SceneError(
                 f"{type(self.density).__name__} removed all Gaussians in step {step + 1}: give it milder thresholds"
             )
+        if self.splats.means is not centres:
+            self.thermal.on_rows_changed()
         self.smoothing.follow(self.splats.means.detach(), step, self.schedule.end, change is not None)
         self.surroundings.after_step(step, self.splats, self.composited)
-        if change is not None:
+        if change is not None or shrunk:
             self._average.forget()
+        if change is not None:
             for group in inner.param_groups:
                 if group["name"] in self._declared:
                     group |= penalties(self._declared[group["name"]], len(self.splats))

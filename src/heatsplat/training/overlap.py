@@ -32,8 +32,9 @@ class Overlap:
         """A loss term, a scalar, where ``signs_at`` gave signs; here there are none, and it is 0."""
         return output.features.new_zeros(())
 
-    def shrink(self, cloud: Cloud, step: int) -> None:
-        """Told after every training step; may change sizes."""
+    def shrink(self, cloud: Cloud, step: int) -> bool:
+        """Told after every training step; may reset sizes. Whether it did."""
+        return False
 
     def settled(self, step: int) -> bool:
         """Whether images after ``step`` tell how good the Gaussians are: not shortly after a reset of sizes."""
@@ -107,12 +108,13 @@ class ShortLists(Overlap):
         )
 
     @torch.no_grad()
-    def shrink(self, cloud: Cloud, step: int) -> None:
+    def shrink(self, cloud: Cloud, step: int) -> bool:
         if not self._resets(step) or cloud.is_held("log_scales"):
-            return
+            return False
         cloud.overwrite("log_scales", cloud.splats["log_scales"] + math.log(self.reset_factor))
         if cloud.optimizer is not None:
             cloud.optimizer.state.clear()
+        return True
 
     def settled(self, step: int) -> bool:
         recent = range(max(step - int(RECOVERY * self.reset_every) + 1, 0), step + 1)
