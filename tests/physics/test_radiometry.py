@@ -123,9 +123,11 @@ def test_sensitivities_are_those_of_finite_differences(response):
     torch.testing.assert_close(found["camera"], (above - below) / 2e-4, rtol=1e-5, atol=1e-9)
 
 
-def test_nothing_is_infinite_where_there_is_no_air():
-    found = sensitivities(DUO.signal(double(300.0)), DUO, Conditions(emissivity=0.9))
-    assert all(torch.isfinite(slope).all() for slope in found.values()) and found["distance_m"] == 0
+@pytest.mark.parametrize("air", [{}, {"humidity": 0.0}, {"humidity": 0.0, "distance_m": 10.0}])
+def test_nothing_is_infinite_where_there_is_no_air_or_no_water_in_it(air):
+    found = sensitivities(DUO.signal(double(300.0)), DUO, Conditions(emissivity=0.9, **air))
+    assert all(torch.isfinite(slope).all() for slope in found.values())
+    assert found["humidity"] == 0 and (found["distance_m"] == 0) == ("distance_m" not in air)
 
 
 def test_propagated_uncertainty_is_the_spread_that_chance_gives():
