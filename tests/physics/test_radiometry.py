@@ -1,5 +1,6 @@
 """The radiometric chain against 40 digits, against itself backwards, and its uncertainty against chance."""
 
+import math
 from dataclasses import replace
 
 import mpmath
@@ -152,6 +153,16 @@ def test_propagated_uncertainty_is_the_spread_that_chance_gives():
     assert stated["combined"].item() == pytest.approx(spread.item(), rel=0.02)
     assert stated["combined"] < sum(stated[name] for name in standard)
     assert stated["camera"] > standard["camera"]  # the air and the emissivity dilute what the camera sees
+
+
+def test_dry_air_is_as_uncertain_as_moisture_would_matter():
+    dry, signal = replace(HAZY, humidity=0.0), measured_signal(double(310.0), DUO, replace(HAZY, humidity=0.0))
+    stated = uncertainty(signal, DUO, dry, {"humidity": 0.05, "camera": 0.5})
+    changed = surface_temperature(signal, DUO, replace(dry, humidity=0.05)) - 310.0
+    assert stated["humidity"].item() == pytest.approx(changed.abs().item(), rel=1e-6) and changed.abs() > 0.05
+    assert stated["combined"].item() == pytest.approx(math.hypot(changed.item(), stated["camera"].item()), rel=1e-6)
+    near = uncertainty(signal, DUO, replace(dry, distance_m=0.0), {"humidity": 0.05})
+    assert near["combined"] == 0
 
 
 def test_the_constants_of_the_air_count():

@@ -216,13 +216,19 @@ def uncertainty(
 ) -> dict[str, Tensor]:
     """Standard uncertainty of the surface's temperature in K: what each input brings, and under "combined" all together.
 
-    By the law of propagation of uncertainty (JCGM 100:2008, GUM, eq. 10) for inputs that are independent of each other.
+    By the law of propagation of uncertainty (JCGM 100:2008, GUM, eq. 10) for inputs that are independent of each other. Where
+    the air is dry, of which the slope tells nothing, the humidity brings what its standard uncertainty itself changes.
 
     Args:
         standard: standard uncertainties in the units of the parameters; "camera" is that of the apparent temperature in K.
     """
     slopes = sensitivities(signal, response, conditions)
     parts = {name: slopes[name].abs() * value for name, value in standard.items()}
+    dry = _double(conditions.humidity) == 0
+    if "humidity" in standard and bool(dry.any()):
+        moist = replace(conditions, humidity=torch.where(dry, standard["humidity"], _double(conditions.humidity)))
+        there, here = (surface_temperature(signal, response, c) for c in (moist, conditions))
+        parts["humidity"] = torch.where(dry, (there - here).abs(), parts["humidity"])
     return parts | {"combined": torch.stack([torch.zeros_like(signal), *parts.values()]).square().sum(0).sqrt()}
 
 
