@@ -92,10 +92,10 @@ def test_orbit_of_a_one_sided_capture_stays_on_its_side(down):
 
 def test_orbit_needs_a_circle():
     one = camera((0.0, 0.0, 0.0))
-    with pytest.raises(
-        ValueError, match="stand on one line of sight and give no orbit; choose trajectory=path or view"
-    ):
-        orbit([one, one], 5)
+    around = [camera(CENTRE, turned.center) for turned in ring(5, height=0.0)]  # a panorama from a tripod
+    for cameras in ([one, one], around):
+        with pytest.raises(ValueError, match="stand at one place or on one line of sight and give no orbit; choose"):
+            orbit(cameras, 5)
     with pytest.raises(ValueError, match="a trajectory needs at least one camera"):
         orbit([], 5)
 

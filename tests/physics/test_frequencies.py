@@ -36,6 +36,11 @@ def test_a_span_beyond_a_day_is_cut_at_the_lowest_frequency():
     assert omega[0].item() == pytest.approx(2 * math.pi * 1e-5)
 
 
+def test_images_too_far_apart_for_the_lowest_frequency_are_told(caplog):
+    omega = frequency_grid(86400.0 * torch.arange(30.0), 4, tau_min=86400.0, gain=HALF_POWER)
+    assert omega[0].item() == pytest.approx(2 * math.pi * 1e-5) and "images at least 24 h apart" in caplog.text
+
+
 @pytest.mark.parametrize("gain", [1.0, 0.999999])
 def test_no_gain_to_lose_leaves_the_narrowest_band(gain):
     omega = frequency_grid(times(0, 1, 2, 100), 5, tau_min=50.0, gain=gain, separation=0.0)

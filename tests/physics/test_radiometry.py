@@ -1,5 +1,6 @@
 """The radiometric chain against 40 digits, against itself backwards, and its uncertainty against chance."""
 
+import math
 from dataclasses import replace
 
 import mpmath
@@ -123,9 +124,11 @@ def test_sensitivities_are_those_of_finite_differences(response):
     torch.testing.assert_close(found["camera"], (above - below) / 2e-4, rtol=1e-5, atol=1e-9)
 
 
-def test_nothing_is_infinite_where_there_is_no_air():
-    found = sensitivities(DUO.signal(double(300.0)), DUO, Conditions(emissivity=0.9))
-    assert all(torch.isfinite(slope).all() for slope in found.values()) and found["distance_m"] == 0
+@pytest.mark.parametrize("air", [{}, {"humidity": 0.0}, {"humidity": 0.0, "distance_m": 10.0}])
+def test_nothing_is_infinite_where_there_is_no_air_or_no_water_in_it(air):
+    found = sensitivities(DUO.signal(double(300.0)), DUO, Conditions(emissivity=0.9, **air))
+    assert all(torch.isfinite(slope).all() for slope in found.values())
+    assert found["humidity"] == 0 and (found["distance_m"] == 0) == ("distance_m" not in air)
 
 
 def test_propagated_uncertainty_is_the_spread_that_chance_gives():
@@ -150,6 +153,16 @@ def test_propagated_uncertainty_is_the_spread_that_chance_gives():
     assert stated["combined"].item() == pytest.approx(spread.item(), rel=0.02)
     assert stated["combined"] < sum(stated[name] for name in standard)
     assert stated["camera"] > standard["camera"]  # the air and the emissivity dilute what the camera sees
+
+
+def test_dry_air_is_as_uncertain_as_moisture_would_matter():
+    dry, signal = replace(HAZY, humidity=0.0), measured_signal(double(310.0), DUO, replace(HAZY, humidity=0.0))
+    stated = uncertainty(signal, DUO, dry, {"humidity": 0.05, "camera": 0.5})
+    changed = surface_temperature(signal, DUO, replace(dry, humidity=0.05)) - 310.0
+    assert stated["humidity"].item() == pytest.approx(changed.abs().item(), rel=1e-6) and changed.abs() > 0.05
+    assert stated["combined"].item() == pytest.approx(math.hypot(changed.item(), stated["camera"].item()), rel=1e-6)
+    near = uncertainty(signal, DUO, replace(dry, distance_m=0.0), {"humidity": 0.05})
+    assert near["combined"] == 0
 
 
 def test_the_constants_of_the_air_count():

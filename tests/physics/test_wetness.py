@@ -84,6 +84,15 @@ def test_a_film_fills_runs_off_and_dries():
     assert (damp[during | (times > 2 * HOUR_S)] == 1).all()  # nothing dries in saturated air
 
 
+@pytest.mark.parametrize("step_s", [1.0, 600.0])
+def test_drizzle_wets_however_often_it_is_recorded(step_s):
+    times = torch.arange(0.0, 2401.0, step_s, dtype=torch.float64)
+    air, humidity = torch.full_like(times, kelvin(12.0)), torch.full_like(times, 98.0)
+    rain = torch.where(times <= 1800.0, 0.3, 0.0).double()
+    wet = wet_share(times, rain, air, humidity, None, 0.3)
+    assert wet[times == 600.0].item() == pytest.approx(0.5, abs=0.02) and wet[times == 1800.0] == 1
+
+
 def test_wet_sheet_metal_is_as_cold_as_the_solver_of_the_yard_has_it():
     times = np.arange(0.0, 6 * HOUR_S + 1, 600.0)
     air = kelvin(22.0 + 4.0 * np.sin(times / HOUR_S))

@@ -252,8 +252,9 @@ def test_what_cannot_be_is_refused():
         HexPlane(Static(), heads=["colour"])
     with pytest.raises(ValueError, match=r"got \[\]"):
         HexPlane(Static(), heads=[])
-    with pytest.raises(ValueError, match="resolutions must be at least 2"):
-        HexPlane(Static(), resolution=1)
+    for name, nodes in (("resolution", 1), ("time_resolution", 0)):
+        with pytest.raises(ValueError, match=f"resolutions must be at least 2, .* got .*{nodes}"):
+            HexPlane(Static(), **{name: nodes})
     for name in ("first_steps", "smooth_space", "smooth_time", "sparse_time"):
         with pytest.raises(ValueError, match=f"{name}.* must not be negative, got .*-1"):
             HexPlane(Static(), **{name: -1})

@@ -18,10 +18,10 @@ from heatsplat.thermal.land_cover import CLASSES
         ({"interval_s": []}, r"interval_s must be a list of 2 numbers, got \[\]"),
         ({"weights": {"edges": 1.0}}, "weights are those of smooth"),
         ({"feature_size": 0}, "feature_size must be at least 1 where features are learned, got 0"),
-        ({"depth_m": -1}, "depth_m and past_h must be above 0 .*, got -1"),
-        ({"past_h": [1.0, -1.0]}, r"depth_m and past_h must be above 0 .*\[1.0, -1.0\]"),
+        ({"depth_m": -1}, "depth_m, smallest_axis_m and past_h must be above 0, got -1"),
+        ({"past_h": [1.0, -1.0]}, r"past_h must be above 0, .*\[1.0, -1.0\]"),
         ({"past_h": ["a"]}, "past_h must be a list of 1 numbers"),
-        ({"smallest_axis_m": -0.1}, "smallest_axis_m not negative, got .*-0.1"),
+        ({"smallest_axis_m": 0.0}, "smallest_axis_m and past_h must be above 0, got 0.05, 0.0"),
         ({"position_frequencies": 0, "features": "none"}, "all Gaussians are alike"),
     ],
 )

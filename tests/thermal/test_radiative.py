@@ -319,6 +319,16 @@ def test_surroundings_that_are_mirrored_white_leave_no_gain(room):
     assert thermal.gain.item() == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(("options", "gain"), [({"emissivity": 0.005}, 0.98 / (0.005 * 0.98**4)), ({"gain": 1e4}, 1e4)])
+def test_bodies_that_hardly_emit_have_a_large_gain(options, gain):
+    """Softplus of it is told without its exponential, which had made it infinite and slopes NaN."""
+    thermal = model(**options)
+    splats = splats_of(thermal, seeds())
+    thermal.features(splats, query()).sum().backward()
+    assert thermal.gain.item() == pytest.approx(gain, rel=1e-6)
+    assert all(tensor.grad.isfinite().all() for tensor in (thermal.raw_gain, splats["temperature"]))
+
+
 def test_plancks_law_is_for_opaque_bodies():
     with pytest.raises(ValueError, match="reflectance=kirchhoff"):
         model(law="band")

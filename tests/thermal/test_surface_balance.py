@@ -27,6 +27,15 @@ def test_a_slab_is_lit_from_its_front_and_half_of_what_a_wall_sees_is_the_ground
         assert float(found) == pytest.approx(watts / (2e6 * 0.03), rel=1e-4)
 
 
+def test_under_no_sky_a_slab_that_faces_up_by_rounding_more_than_that_has_a_temperature():
+    up = torch.tensor([-0.32, 0.18, 0.93], dtype=torch.float64)
+    normal = (1.0 + 3e-7) * (up / up.norm()).float()
+    weather = make_weather(up=up / up.norm())
+    body = {name: torch.full((1,), value) for name, value in BODY.items()}
+    rate = SurfaceBalance("none", 0.03).rate(torch.full((1,), 300.0), body, {"normals": normal[None]}, weather, 0.0)
+    assert rate.isfinite().all()
+
+
 def test_a_slab_has_a_thickness():
     with pytest.raises(ValueError, match="depth_m must be positive, got 0"):
         SurfaceBalance("none", 0.0)

@@ -59,6 +59,17 @@ def test_what_the_weather_lacks_is_left_out_and_said():
         driven(bare, mean_wind=3.0)
 
 
+def test_wind_that_training_did_not_have_is_left_out_and_said(caplog):
+    for exchange in ("learned", "iso_6946"):
+        caplog.clear()
+        _, effects = driven(mean_wind=0.0, exchange=exchange)
+        assert effects["convection"]["left_out"] == "wind, of which there was none in training"
+        assert "wind" not in effects["convection"] and "as in still air" in caplog.text
+    caplog.clear()
+    _, effects = driven(weather(wind_m_s=torch.zeros_like(weather().air_c)), mean_wind=0.0, exchange="iso_6946")
+    assert effects["convection"]["wind"] == "recorded, 0 m/s throughout" and not caplog.text
+
+
 def test_rain_changes_the_air_of_wet_surfaces_and_not_their_sky():
     dry, _ = driven()
     wet, _ = driven(rain=0.3)

@@ -43,7 +43,8 @@ def orbit(cameras: Sequence[Camera], count: int) -> list[Camera]:
     radii = outward.norm(dim=1)
     if radii.max() < 1e-6 * (1 + offsets.norm(dim=1).max()):
         raise ValueError(
-            "the training cameras stand on one line of sight and give no orbit; choose trajectory=path or view instead"
+            "the training cameras stand at one place or on one line of sight and give no orbit; choose trajectory=path or view "
+            "instead"
         )
     first = outward[radii.argmax()] if radii[0] < 1e-3 * radii.max() else outward[0]
     first = first / first.norm()

@@ -30,14 +30,15 @@ def frequency_grid(
 ) -> Tensor:
     """Angular frequencies [K'] in rad/s, float64, ascending, K' <= count (ETGS Eq. 7 and 27-34).
 
-    Log-uniform from one cycle over the observed span up to what the sampling resolves (half the inverse of the smallest gap)
-    and what a body with time constant ``tau_min`` still follows with amplitude ``gain``; at least 1.2 times the lowest
-    frequency. Of these, from the lowest up, those stay that complete ``separation`` cycles more over the span than the last
-    one that stayed: a record of that length cannot tell closer ones apart.
+    Log-uniform from one cycle over the observed span, or ``LOWEST_HZ`` where that is more, up to what the sampling resolves
+    (half the inverse of the smallest gap) and what a body with time constant ``tau_min`` still follows with amplitude
+    ``gain``; at least 1.2 times the lowest frequency. Of these, from the lowest up, those stay that complete ``separation``
+    cycles more over the span than the last one that stayed: a record of that length cannot tell closer ones apart.
 
     **Degenerate cases:** repeated timestamps count once; count = 1 gives the lowest frequency alone; fewer than two
     distinct timestamps (or count = 0) give an empty grid, so that a model falls back to pure relaxation, with a
-    warning; equal frequencies are removed; gain = 1 allows no frequency above the lowest, which leaves the band of 1.2.
+    warning; equal frequencies are removed; gain = 1 allows no frequency above the lowest, which leaves the band of 1.2;
+    where the sampling resolves less than ``LOWEST_HZ``, that band lies above it, with a warning.
 
     Args:
         timestamps: [F] seconds, in any order.
@@ -69,6 +70,13 @@ def frequency_grid(
     span = gaps.sum().item()
     lowest = max(1 / span, LOWEST_HZ)
     sampled = 0.5 / gaps.min().item()
+    if sampled < LOWEST_HZ:
+        log.warning(
+            "images at least %.3g h apart cannot tell frequencies of %g Hz and more, so that what a heat source does between "
+            "them is arbitrary: thermal.frequencies=0 leaves relaxation alone",
+            gaps.min().item() / 3600.0,
+            LOWEST_HZ,
+        )
     followed = math.sqrt((1 - gain) * (1 + gain)) / gain / (2 * math.pi * tau_min)
     highest = max(min(sampled, followed), NARROWEST_BAND * lowest)
     steps = torch.arange(int(count), dtype=torch.float64) / max(count - 1, 1)

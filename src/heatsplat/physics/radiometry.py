@@ -156,17 +156,21 @@ def transmittance(
 
     x e^(-√d (α1 + β1 √ω)) + (1 - x) e^(-√d (α2 + β2 √ω)), with ω of ``water_vapour``.
 
-    **Convention:** at long distances through wet air the formula falls below zero; there the result is NaN. Its slope by the
-    distance is infinite at 0 m, where it counts as 0.
+    **Convention:** at long distances through wet air the formula falls below zero; there the result is NaN. Its slopes by
+    the distance at 0 m and by the humidity at 0 are infinite, and count as 0 there.
     """
     a = atmosphere or Atmosphere()
-    distance = _double(distance_m)
-    root = torch.where(distance > 0, torch.where(distance > 0, distance, 1.0).sqrt(), 0.0)
-    wet = water_vapour(air_k, humidity).sqrt()
+    root, wet = _root(_double(distance_m)), _root(water_vapour(air_k, humidity))
     found = a.x * torch.exp(-root * (a.alpha_1 + a.beta_1 * wet)) + (1.0 - a.x) * torch.exp(
         -root * (a.alpha_2 + a.beta_2 * wet)
     )
     return torch.where(found > 0, found.clamp(max=1.0), math.nan)
+
+
+def _root(values: Tensor) -> Tensor:
+    """Square root whose slope at 0 is 0."""
+    there = values > 0
+    return torch.where(there, torch.where(there, values, 1.0).sqrt(), 0.0)
 
 
 def _of_itself_and_the_rest(response: Response, conditions: Conditions) -> tuple[Tensor, Tensor]:
@@ -212,13 +216,19 @@ def uncertainty(
 ) -> dict[str, Tensor]:
     """Standard uncertainty of the surface's temperature in K: what each input brings, and under "combined" all together.
 
-    By the law of propagation of uncertainty (JCGM 100:2008, GUM, eq. 10) for inputs that are independent of each other.
+    By the law of propagation of uncertainty (JCGM 100:2008, GUM, eq. 10) for inputs that are independent of each other. Where
+    the air is dry, of which the slope tells nothing, the humidity brings what its standard uncertainty itself changes.
 
     Args:
         standard: standard uncertainties in the units of the parameters; "camera" is that of the apparent temperature in K.
     """
     slopes = sensitivities(signal, response, conditions)
     parts = {name: slopes[name].abs() * value for name, value in standard.items()}
+    dry = _double(conditions.humidity) == 0
+    if "humidity" in standard and bool(dry.any()):
+        moist = replace(conditions, humidity=torch.where(dry, standard["humidity"], _double(conditions.humidity)))
+        there, here = (surface_temperature(signal, response, c) for c in (moist, conditions))
+        parts["humidity"] = torch.where(dry, (there - here).abs(), parts["humidity"])
     return parts | {"combined": torch.stack([torch.zeros_like(signal), *parts.values()]).square().sum(0).sqrt()}
 
 

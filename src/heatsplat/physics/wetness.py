@@ -75,7 +75,8 @@ def wet_share(
                 even = min((film - COVERS_MM) / leaves if leaves > 0 else math.inf, left)
                 film, left = film - even * leaves, left - even
             film *= math.exp(-left * leaves / COVERS_MM)
-        film = film if film > 1e-3 * COVERS_MM else 0.0
+        # A trace is dry once the rain is over; while it rains, what has fallen since the last sample may be no more than that.
+        film = film if film > 1e-3 * COVERS_MM or rain[k + 1] > 0.0 else 0.0
         found.append(min(film / COVERS_MM, 1.0))
     return torch.tensor(found, dtype=torch.float64)
 

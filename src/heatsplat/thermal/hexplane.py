@@ -93,7 +93,8 @@ class HexPlane(Wrapper):
         unknown = [name for name in heads if name not in HEADS]
         if unknown or not heads:
             raise ValueError(f"heads must name some of {', '.join(HEADS)}, got {list(heads)}")
-        if min(resolution, time_resolution or 2) < 2 or min(channels, width, *scales, 1) < 1 or not scales:
+        nodes = 2 if time_resolution is None else time_resolution
+        if min(resolution, nodes) < 2 or min(channels, width, *scales, 1) < 1 or not scales:
             raise ValueError(
                 "resolutions must be at least 2, scales, channels and width at least 1, got "
                 f"{resolution}, {time_resolution}, {list(scales)}, {channels}, {width}"
@@ -108,7 +109,6 @@ class HexPlane(Wrapper):
         self.lr, self.lr_planes, self.lr_end = lr, lr_planes, lr_end
         sizes = [scale * resolution for scale in scales]
         self.space = nn.ParameterList(torch.zeros(len(PAIRS), channels, size, size) for size in sizes)
-        nodes = time_resolution or 2
         self.time = nn.ParameterList(torch.ones(3, channels, nodes, size) for size in sizes)
         self.trunk = nn.Linear(channels * len(sizes), width)
         self.heads = nn.ModuleDict(

@@ -62,10 +62,10 @@ class NetworkOptions:
         check_numbers("past_h", self.past_h, len(self.past_h))
         check_numbers("interval_s", self.interval_s, 2)
         check_frames_per_cycle(self.frames_per_cycle)
-        if min((self.depth_m, *self.past_h)) <= 0 or self.smallest_axis_m < 0:
+        if min((self.depth_m, self.smallest_axis_m, *self.past_h)) <= 0:
             raise ValueError(
-                f"depth_m and past_h must be above 0 and smallest_axis_m not negative, got {self.depth_m}, "
-                f"{list(self.past_h)} and {self.smallest_axis_m}"
+                f"depth_m, smallest_axis_m and past_h must be above 0, got {self.depth_m}, {self.smallest_axis_m} and "
+                f"{list(self.past_h)}"
             )
         positive = (self.width, self.blocks, self.time_frequencies, self.sampled)
         counts = (self.position_frequencies, self.first_steps, self.ramp_steps)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -132,7 +131,8 @@ class Radiative(Wrapper):
             self.raw_surroundings = nn.Parameter(torch.logit(torch.tensor(surroundings)))
         if three_parameter and law == "grey":
             self._white = gain is None
-            self.raw_gain = nn.Parameter(torch.tensor(0.0 if gain is None else math.log(math.expm1(gain))))
+            raw = _raw_of(torch.tensor(1.0 if gain is None else gain, dtype=torch.float64))
+            self.raw_gain = nn.Parameter(raw.float())
             self._set_white()
 
     @property
@@ -156,7 +156,7 @@ class Radiative(Wrapper):
                     "thermal.reflectance_start, or the scene a range of temperatures that its surroundings are nearer to"
                 )
             gain = (1.0 - mirrored) / (self.emissivity * START[1] ** 4)
-            self.raw_gain.copy_(gain.expm1().log())
+            self.raw_gain.copy_(_raw_of(gain))
 
     # What the contract asks -----------------------------------------------------------------------------
 
@@ -265,3 +265,8 @@ class Radiative(Wrapper):
         degree = self.degrees[name]
         rest = splats[f"{name}_rest"] if degree > 0 else None
         return spherical_harmonics_of(splats[name], rest, splats.means, query, degree)
+
+
+def _raw_of(gain: Tensor) -> Tensor:
+    """What softplus, which leaves values above 20 as they are, makes a gain of; e to large ones would overflow."""
+    return torch.where(gain > 20.0, gain, gain.expm1().log())

@@ -52,7 +52,7 @@ class SurfaceBalance:
     ) -> Tensor:
         """As ``EllipsoidBalance.rate``."""
         normals = areas["normals"]
-        above = 0.5 * (1.0 + normals @ weather.up.to(normals))
+        above = 0.5 * (1.0 + normals @ weather.up.to(normals)).clamp(max=2.0)  # more by rounding
         lit = torch.zeros_like(above)
         for direction, power in sunlight_at(weather, time_s):
             diffuse = direction is weather.up

@@ -186,13 +186,18 @@ def _wind(weather: Weather, options: BalanceOptions, mean_wind: float) -> Contri
             raise SceneError("the model was trained with wind, but this weather has no wind_m_s; add it")
         recorded = f"recorded, {mean_wind:.3g} m/s in the mean"
         return Contribution({"wind_anomaly": weather.wind_m_s / mean_wind - 1}, {"convection": {"wind": recorded}})
+    blows = weather.wind_m_s is not None and bool((weather.wind_m_s > 0).any())
+    lacks = "which the weather lacks" if weather.wind_m_s is None else "of which there was none in training"
+    left_out = {"left_out": f"wind, {lacks}"}
+    if blows:
+        log.warning("the weather has wind, %s: surfaces stay as in still air", lacks)
     if options.convection is None:
-        lacks = "which the weather lacks" if weather.wind_m_s is None else "of which there was none in training"
-        return Contribution(effects={"convection": {"left_out": f"wind, {lacks}"}})
+        return Contribution(effects={"convection": left_out})
     if weather.wind_m_s is None:
         raise SceneError(f"exchange={options.exchange} needs wind_m_s, which the weather does not have")
     still = torch.zeros_like(weather.wind_m_s)
-    return Contribution({"wind_anomaly": still}, {"convection": {"wind": "recorded, 0 m/s throughout"}})
+    told = left_out if blows else {"wind": "recorded, 0 m/s throughout"}
+    return Contribution({"wind_anomaly": still}, {"convection": told})
 
 
 def _rain(weather: Weather, options: BalanceOptions, reference_k: float) -> Contribution:
