@@ -62,7 +62,8 @@ def describe_effects(module: pl.LightningModule) -> dict[str, dict[str, Any]]:
     """Physical effects by name, for metrics.json: those that are simulated with their settings.
 
     Where a scene chose them there is an entry for every effect of the catalogue, with the verdict on it, how many numbers
-    it adds to this many Gaussians ("parameters") and what a step of training costs more ("ms_per_step").
+    it adds to this many Gaussians ("parameters") and what a step of training costs more ("ms_per_step"). One that is off
+    has settings where a part of it is simulated all the same.
     """
     simulated = module.thermal.effects() | module.sensor.effects()
     verdicts = module.config.get("verdicts")
@@ -76,7 +77,7 @@ def describe_effects(module: pl.LightningModule) -> dict[str, dict[str, Any]]:
             verdict["shared"] + verdict["per_gaussian"] * len(module.splats) if priced else None if verdict["on"] else 0
         )
         described[name]["ms_per_step"] = verdict["ms_per_step"] if priced else None if verdict["on"] else 0.0
-        if verdict["on"]:
+        if verdict["on"] or name in simulated:  # wet surfaces follow the air, whether or not wind blows
             described[name]["settings"] = simulated.get(name, {})
     return described
 
