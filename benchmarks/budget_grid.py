@@ -28,7 +28,7 @@ from heatsplat.io.results import CURVE_FILE, RunResults
 from heatsplat.io.tables import NONE, markdown_table, number, read_csv
 from heatsplat.runs.curves import Curve, Point, curves_of, merged, read_points, write_points
 from heatsplat.studies.child_runs import all_rows, train_or_read
-from heatsplat.studies.options import listed, non_empty, whole_numbers
+from heatsplat.studies.options import listed, non_empty, of_runs, whole_numbers
 
 TABLE_FILE, PICTURE_FILE, POINTS_FILE = "budget.md", "budget.png", "budget_curves.csv"
 
@@ -103,7 +103,7 @@ def run(
         SceneError: an option or ``curves`` cannot be used as it is, or a run failed.
     """
     folder, overrides, budgets = Path(output_dir).resolve(), listed(overrides), listed(budgets)
-    common = [*([f"threads={threads}"] if threads else []), *overrides]
+    common = of_runs(overrides, threads)
     grid = []
     pairs = _pairs(scenes)
     for budget in budgets:

@@ -16,7 +16,7 @@ from heatsplat.io.pictures import figure_picture, write_png
 from heatsplat.io.results import RunResults
 from heatsplat.io.tables import markdown_table, number, over_seeds
 from heatsplat.studies.child_runs import all_rows, train_or_read
-from heatsplat.studies.options import listed, non_empty, subset_of, whole_numbers
+from heatsplat.studies.options import non_empty, of_runs, subset_of, whole_numbers
 
 TABLE_FILE, PICTURE_FILE = "effects.md", "effects.png"
 SELECTIONS = ("auto", "none", "all", "oracle")
@@ -113,7 +113,7 @@ def run(
     selections = subset_of("study.selections", selections, SELECTIONS)
     seeds = whole_numbers("study.seeds", seeds, least=0)
     folder = Path(output_dir).resolve()
-    common = [*([f"threads={threads}"] if threads else []), *listed(overrides)]
+    common = of_runs(overrides, threads)
     known: dict[tuple[str, int, frozenset[str]], RunResults] = {}  # by preset, seed and effects that are on
 
     def of(job: Job, expected: frozenset[str] | None) -> RunResults:

@@ -4,7 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from heatsplat.contracts import SceneError
-from heatsplat.studies.options import listed, non_empty, subset_of, whole_numbers
+from heatsplat.studies.options import listed, non_empty, of_runs, subset_of, whole_numbers
 
 
 @pytest.mark.parametrize(
@@ -21,6 +21,10 @@ from heatsplat.studies.options import listed, non_empty, subset_of, whole_number
 )
 def test_a_word_or_number_is_a_list_of_one(typed, expected):
     assert listed(typed) == expected
+
+
+def test_runs_of_a_study_have_its_threads_unless_their_overrides_say_others():
+    assert of_runs("max_steps=9", 2) == ["threads=2", "max_steps=9"] and of_runs(None, None) == []
 
 
 @pytest.mark.parametrize("empty", [[], None])

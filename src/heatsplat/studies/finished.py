@@ -21,20 +21,8 @@ log = logging.getLogger(__name__)
 
 # Columns of a table of runs that are no score; a score of this name, of a callback that is not ours, has none.
 COLUMNS = {
-    "folder",
-    "scene",
-    "method",
-    "row",
-    "overrides",
-    "failed",
-    "results",
-    "data",
-    "name",
-    "other",
-    "title",
-    "measured",
-    "course",
-}
+    "folder", "scene", "method", "row", "overrides", "failed", "results", "data", "name", "other", "title", "measured", "course",
+}  # fmt: skip
 # Overrides that make no other recipe. runs.resume.NOT_LEARNED, and the keys that conf/train.yaml leaves out of the names of
 # folders, are among them; the method is named by itself.
 SEEDS = {"seed", "data.seed", "data.scene_seed"}

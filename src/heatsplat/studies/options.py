@@ -15,6 +15,11 @@ def listed(value: Any) -> list[Any]:
     return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else [value]
 
 
+def of_runs(overrides: Any, threads: int | None) -> list[str]:
+    """Overrides of the runs of a study (``listed``), with the number of their CPU threads before them; None leaves it to them."""
+    return [*([] if threads is None else [f"threads={threads}"]), *listed(overrides)]
+
+
 def non_empty(key: str, value: Any) -> list[Any]:
     """``listed``, where nothing can be done without a value.
 

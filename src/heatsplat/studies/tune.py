@@ -22,7 +22,7 @@ from heatsplat.io.tables import markdown_table, number, over_seeds, write_csv
 from heatsplat.metrics.definitions import DEFINITIONS, described
 from heatsplat.studies.child_runs import OtherSettingsError, all_rows, spelled, train_or_read
 from heatsplat.studies.finished import reason_of
-from heatsplat.studies.options import listed, whole_numbers
+from heatsplat.studies.options import listed, of_runs, whole_numbers
 
 log = logging.getLogger("heatsplat")
 
@@ -169,7 +169,7 @@ def run(
         ImportError: optuna is not installed.
     """
     output_dir, seeds, check_steps = Path(output_dir), listed(seeds), listed(check_steps)
-    overrides = [*([] if threads is None else [f"threads={threads}"]), *listed(overrides)]
+    overrides = of_runs(overrides, threads)
     chosen = _checked(cases, listed(methods), trials, seeds, score)
     for key, steps in (("search_steps", [search_steps]), ("check_steps", check_steps)):
         for count in steps:

@@ -21,7 +21,7 @@ from heatsplat.io.tables import write_csv
 from heatsplat.studies.child_runs import train_or_read
 from heatsplat.studies.finished import settings_of
 from heatsplat.studies.frontier.runs import find_runs
-from heatsplat.studies.options import listed, non_empty
+from heatsplat.studies.options import listed, non_empty, of_runs
 from heatsplat.studies.time_to_accuracy.report import markdown, picture, records
 from heatsplat.studies.time_to_accuracy.runs import Panel, panels_of, without_length
 
@@ -74,7 +74,7 @@ def run(
             cases and no seed, a run of the study failed, or there is no finished reference.
     """
     output_dir, reference = Path(output_dir), listed(reference)
-    overrides = [*([] if threads is None else [f"threads={threads}"]), *listed(overrides)]
+    overrides = of_runs(overrides, threads)
     recipes = {name: listed(given) for name, given in recipes.items() if given is not None}
     check_option("study.clock", clock, CLOCKS, SceneError)
     margins = {"psnr": psnr_margin_db, "mae_c": mae_margin_c}
