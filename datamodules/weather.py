@@ -29,6 +29,8 @@ log = logging.getLogger(__name__)
 
 # Longest time without a value that is bridged by a straight line, unless the configuration says otherwise.
 MAX_GAP_S = 3 * 3600.0
+# Share of a record from which it is worth a warning that a column which begins late or ends early shortens it.
+CUT = 0.1
 # The sun moves 2.5 degrees in this time; between samples all series are linear.
 SUN_STEP_S = 600.0
 
@@ -207,12 +209,22 @@ def _common_span(
     times_s: np.ndarray, columns: dict[str, np.ndarray], notes: dict[str, Any]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """The part of the record that all columns span, so that nothing is extrapolated."""
-    ends = [np.flatnonzero(np.isfinite(values))[[0, -1]] for values in columns.values()]
-    first, last = max(e[0] for e in ends), min(e[1] for e in ends)
+    ends = {name: np.flatnonzero(np.isfinite(values))[[0, -1]] for name, values in columns.items()}
+    latest, earliest = max(ends, key=lambda name: ends[name][0]), min(ends, key=lambda name: ends[name][1])
+    first, last = ends[latest][0], ends[earliest][1]
     if first >= last:
-        raise SceneError(f"{notes['source']}: its columns have no span of time in common; leave one of them out")
+        raise SceneError(
+            f"{notes['source']}: {latest} begins at {_moment(times_s[first])}, when {earliest} has ended "
+            f"({_moment(times_s[last])}), so its columns have no span of time in common; leave one of them out"
+        )
     if cut := len(times_s) - (last - first + 1):
-        notes["cut"] = f"{cut} samples at the ends lack a column and are left out"
+        short = " and ".join(dict.fromkeys([latest] * bool(first > 0) + [earliest] * bool(last + 1 < len(times_s))))
+        notes["cut"] = f"{cut} samples at the ends lack {short} and are left out"
+        if cut > CUT * len(times_s):
+            log.warning(
+                "%s: %s; the record that remains runs from %s to %s. Without that column it would be longer",
+                notes["source"], notes["cut"], _moment(times_s[first]), _moment(times_s[last]),
+            )  # fmt: skip
     return times_s[first : last + 1], {name: values[first : last + 1] for name, values in columns.items()}
 
 

@@ -44,6 +44,22 @@ def test_samples_are_sorted_merged_and_gaps_are_bridged_and_told(table):
     assert notes["ranges"]["air_c"] == [10.0, 14.0] and notes["span_h"] == 1.0
 
 
+def test_a_column_that_shortens_the_record_is_named_and_a_short_rest_is_worth_a_warning(table, caplog):
+    hours = [f"{600 * i},{10 + i},{2 if 6 <= i < 12 else ''}" for i in range(20)]
+    weather = read_weather(table("time_s,air_c,wind_m_s", *hours))
+    assert weather.times_s.tolist()[:1] + weather.times_s.tolist()[-1:] == [3600.0, 6600.0]
+    assert weather.notes["cut"] == "14 samples at the ends lack wind_m_s and are left out"
+    assert (
+        "weather.csv: 14 samples at the ends lack wind_m_s" in caplog.text
+        and "second 3600 to second 6600" in caplog.text
+    )
+
+
+def test_a_sample_that_a_column_lacks_at_the_end_is_no_warning(table, caplog):
+    lines = [f"{600 * i},{10 + i},{2 if i < 19 else ''}" for i in range(20)]
+    assert "lack wind_m_s" in read_weather(table("time_s,air_c,wind_m_s", *lines)).notes["cut"] and not caplog.text
+
+
 def test_a_column_without_values_counts_as_missing(table):
     weather = read_weather(table("time_s,air_c,wind_m_s", "0,10,", "60,11,NA"))
     assert weather.wind_m_s is None and "wind_m_s" in weather.notes["missing"]
@@ -90,7 +106,10 @@ def test_a_column_without_values_counts_as_missing(table):
             "air_c is 290 at second 0 .2 such values.; .* Check the column and its unit",
         ),
         (["time_s,air_c", "0,1", "36000,2"], "air_c has no value for 10 hours after second 0, longer than the 3 hours"),
-        (["time_s,air_c,wind_m_s", "0,1,", "60,1,", "120,,2", "180,,3"], "no span of time in common"),
+        (
+            ["time_s,air_c,wind_m_s", "0,1,", "60,1,", "120,,2", "180,,3"],
+            "wind_m_s begins at second 120, when air_c has ended .second 60., so its columns have no span",
+        ),
     ],
 )
 def test_bad_tables_are_refused_by_line_and_column(table, lines, message):
