@@ -45,11 +45,13 @@ def settings(depths: Tensor, inspected: Inspection) -> dict[str, Any]:
     What the joint fit knows of them to a thousandth training would have to find anew, beside surfaces that can be brighter
     through thicker air.
     """
-    if len(depths) == 1:
-        return {"depth": round(max(float(depths), THINNEST), 3), "moments": 0}
+    times_s = inspected.obs.times_s
+    no_record = times_s is None or bool((times_s == times_s[0]).all())  # along which it could change
+    if len(depths) == 1 or no_record:
+        return {"depth": round(max(float(depths.mean()), THINNEST), 3), "moments": 0}
     first, span = inspected.given.record
     count = max(2, min(len(depths), MOMENTS))
-    places = (inspected.obs.times_s - first) / span * (count - 1)
+    places = (times_s - first) / span * (count - 1)
     curve = smooth_values(places, depths, count, BEND).clamp(THINNEST, MAX_DEPTH)
     return {"depth": [round(depth, 4) for depth in curve.tolist()], "moments": count}
 
