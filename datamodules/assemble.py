@@ -35,7 +35,7 @@ from heatsplat.datamodules.poses import MAX_COORDINATE
 from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, check_masks, image_notes, prepare
 from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
 from heatsplat.datamodules.side_files import finite
-from heatsplat.datamodules.splits import SplitRule
+from heatsplat.datamodules.splits import ALL, SplitRule
 from heatsplat.datamodules.weather import weather_at_frame
 from heatsplat.datamodules.weather_table import FIRST_EPOCH_S
 from heatsplat.physics.defects import dead_pixels
@@ -43,6 +43,7 @@ from heatsplat.physics.defects import dead_pixels
 log = logging.getLogger(__name__)
 
 MAX_VAL_VIEWS = 8
+FITTED = "scores tell how well they are fitted, not how well other views are foreseen"
 # Seconds: three hundred centuries, more than any clock of a recording counts.
 MAX_TIME_S = 1e12
 # Share of the range of the training images that bounds taken from them leave at both ends, for the noise of held-out ones.
@@ -203,7 +204,10 @@ def _split(
         "val_views": f"{len(val)} of the test views, evenly spaced; they draw curves and select nothing",
     }
     if both := sorted(set(train) & set(test)):
-        notes["split_in_both"] = f"{counted(len(both), 'test frame')} trained on, too: scores flatter the run"
+        notes["split_in_both"] = f"{counted(len(both), 'test frame')} trained on, too: {FITTED}"
+    if rule.rule == ALL:
+        log.info("data.split=all: no frame is held out, and %s", notes["split_in_both"])
+    elif both:
         log.warning(
             "data.split=%s: training and test have %s in common (%s), so that scores flatter the run; name each in one list",
             rule.rule, counted(len(both), "frame"), ", ".join(frames[i].name for i in both[:3]) + ", ..." * (len(both) > 3),

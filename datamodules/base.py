@@ -41,7 +41,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         root: folder of the data set, relative to the caller's working directory.
         scene: name of the scene below ``root``; None when ``root`` is the scene itself.
         downscale: factor by which images shrink, 1 or larger.
-        split: every_8th, quarter_centre, block, names, folders, json or list (``heatsplat.datamodules.splits``).
+        split: every_8th, quarter_centre, block, names, folders, json, list or all (``heatsplat.datamodules.splits``).
         split_fraction: share of the frames that ``block`` holds out.
         split_position: where its stretch lies in time, 0 (start) to 1 (end).
         split_file: file of test names for ``list``, relative to the scene or the working directory.

@@ -14,6 +14,7 @@ from heatsplat.datamodules.side_files import found_file, json_object, read_text,
 
 Positions = tuple[list[int], list[int]]
 
+ALL = "all"  # rule that holds nothing out
 TRAIN_WORDS = ("train",)
 TEST_WORDS = ("test", "eval", "val")
 
@@ -27,6 +28,11 @@ def every_nth(names: Sequence[str], n: int = 8) -> Positions:
     """Every n-th name in plain string order is test, the first one included (3DGS, Thermal3D-GS)."""
     order = sorted(range(len(names)), key=lambda i: names[i])
     return _complement(len(names), order[::n])
+
+
+def every_frame(names: Sequence[str], n: int = 8) -> Positions:
+    """All frames are training frames; those that ``every_nth`` would hold out are test frames, too."""
+    return list(range(len(names))), every_nth(names, n)[1]
 
 
 def quarter_centre(order: Sequence[int]) -> Positions:
@@ -154,7 +160,7 @@ class SplitRule:
     """A split as it stands in a configuration.
 
     Args:
-        rule: every_8th, quarter_centre, block, names, folders, json (what the data set itself lists) or list.
+        rule: every_8th, quarter_centre, block, names, folders, json (what the data set itself lists), list or all.
         fraction, position: of ``block``.
         file: of ``list``, relative to ``folder`` or the working directory.
         folder: of the scene; None where it has none.
@@ -170,7 +176,7 @@ class SplitRule:
     file: str | Path | None = None
     folder: Path | None = None
 
-    RULES = ("every_8th", "quarter_centre", "block", "names", "folders", "json", "list")
+    RULES = ("every_8th", "quarter_centre", "block", "names", "folders", "json", "list", ALL)
 
     def __post_init__(self) -> None:
         check_option("data.split", self.rule, self.RULES, SceneError)
@@ -187,7 +193,7 @@ class SplitRule:
             )
 
     def __call__(self, names: Sequence[str], order: Sequence[int], subsets: Sequence[str | None]) -> Positions:
-        """(train, test) positions. Raises SceneError when the rule leaves one of the two empty."""
+        """(train, test) positions, which may share frames. Raises SceneError when the rule leaves one of the two empty."""
         rules = {
             "every_8th": lambda: every_nth(names, 8),
             "quarter_centre": lambda: quarter_centre(order),
@@ -196,6 +202,7 @@ class SplitRule:
             "folders": lambda: by_subset(subsets) if any(subsets) else by_folder(names),
             "json": lambda: by_subset(subsets),
             "list": lambda: by_list(names, found_file("data.split_file", self.file, self.folder)),
+            ALL: lambda: every_frame(names),
         }
         train, test = rules[self.rule]()
         if not train or not test:

@@ -29,6 +29,15 @@ def test_names_are_shown_as_they_are(tmp_path, capsys):
     assert "[new](x)" in said and ":fire:" in said and "[old]/report.md" in said and "a [b].png" in said
 
 
+def test_scores_of_images_that_were_trained_on_say_so_where_they_stand(tmp_path, capsys):
+    said = "4 test frames trained on, too: scores tell how well they are fitted"
+    for data, shown in (({}, False), ({"split_in_both": said}, True)):
+        results = RunResults(run={"method": "auto", "scene": "a"}, data=data)
+        assert (f"\n**{said}.**\n" in markdown(results, tmp_path, [], None)) == shown
+        show(results, tmp_path, None)
+        assert (said in capsys.readouterr().out) == shown
+
+
 def test_a_score_of_an_own_callback_has_the_unit_of_its_definition():
     definitions = {
         "error": "K, lower is better: root",

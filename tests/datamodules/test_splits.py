@@ -4,6 +4,7 @@ import pytest
 from layouts import names, write_colmap
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.assemble import FITTED
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.splits import SplitRule, block, by_folder, by_list, by_name, every_nth, quarter_centre
 
@@ -17,6 +18,18 @@ def test_every_8th_follows_plain_string_order():
 
 def test_307_registered_views_give_the_39_test_views_that_ti_nsd_reports():
     assert len(every_nth([f"{i}.png" for i in range(307)])[1]) == 39
+
+
+def test_all_trains_on_every_frame_and_says_what_scores_then_tell(tmp_path, caplog):
+    files = names(11)
+    write_colmap(tmp_path, files)
+    caplog.set_level("INFO")
+    scene = Colmap(root=str(tmp_path), split="all").scene
+    assert [frame.name for frame in scene.train.frames] == files and len(scene.frames) == 11
+    held_out = Colmap(root=str(tmp_path)).scene.test
+    assert [frame.name for frame in scene.test.frames] == [frame.name for frame in held_out.frames]
+    assert scene.notes["split_in_both"] == "2 test frames trained on, too: " + FITTED and FITTED in caplog.text
+    assert not any(record.levelname == "WARNING" for record in caplog.records)
 
 
 def test_quarter_centre_takes_the_middle_eighth_of_each_quarter():
@@ -148,4 +161,4 @@ def test_frames_in_both_lists_are_told(tmp_path, caplog):
     assert (
         f"data.split=list: training and test have 1 frame in common ({files[1]}), so that scores flatter" in caplog.text
     )
-    assert scene.notes["split_in_both"] == "1 test frame trained on, too: scores flatter the run"
+    assert scene.notes["split_in_both"] == "1 test frame trained on, too: " + FITTED

@@ -18,7 +18,7 @@ from rich.table import Table
 from heatsplat.callbacks.board import board
 from heatsplat.callbacks.describe import describe_data, describe_effects, describe_run, hyperparameters
 from heatsplat.callbacks.images import file_stem
-from heatsplat.callbacks.report_text import cells, effects_table, markdown
+from heatsplat.callbacks.report_text import IN_BOTH, cells, effects_table, markdown
 from heatsplat.contracts import Frame, check_count, evenly_spread
 from heatsplat.io.files import write_atomically
 from heatsplat.io.page import PAGE_FILE, write_page
@@ -129,6 +129,8 @@ def show(results: RunResults, folder: Path, picture: Path | None, console: Conso
     for (_, *score), (_, *cost) in zip_longest(cells(content, "test"), cells(content, "cost"), fillvalue=("",) * 3):
         table.add_row(*score, *cost)
     console.print(table)
+    if in_both := content["data"].get(IN_BOTH):
+        console.print(f"scores:  {in_both}", soft_wrap=True)
     console.print(f"machine: {run.get('machine')}; threads: {run.get('threads')}", soft_wrap=True)
     page = folder / PAGE_FILE
     console.print(f"report:  {page if page.exists() else folder / REPORT_FILE}", soft_wrap=True)

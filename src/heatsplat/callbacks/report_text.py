@@ -41,6 +41,7 @@ DATA_VALUES = {
     "L": "one, grey",
     "RGB": "three, colours",
     "every_8th": "every 8th image",
+    "all": "every 8th image; all are trained on",
 }
 TWICE = {
     "train_views": "views",
@@ -49,6 +50,7 @@ TWICE = {
     "twice_gain_db": "twice",
     "twice_steps": "twice",
 }  # told by the other name, where that is there
+IN_BOTH = "split_in_both"  # in the data, where test images were trained on
 PARTS = {"train": "to train", "val": "to validate", "test": "to test"}
 
 
@@ -72,6 +74,8 @@ def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves
             missing.setdefault(reasons[name], []).append(f"`{name}`")
     if missing:
         lines += ["", "Not available:", "", *(f"- {', '.join(names)}: {reason}" for reason, names in missing.items())]
+    if content["data"].get(IN_BOTH):
+        lines += ["", f"**{content['data'][IN_BOTH]}.**"]
     if (folder / VIEWER_FILE).exists():
         lines += ["", f"Interactive 3D view with temperatures: [{VIEWER_FILE}]({VIEWER_FILE})."]
     if pictures:

@@ -73,7 +73,8 @@ def on_scales(
             log.info("times are counted from frame %s, as in training", first)
             scene = _since(scene, later)
     check_frames(scales.get("frames"), scene, exactly=exactly, numbered=numbered)
-    trained = {*(scales.get("frames") or {}).get("names", ())}
+    # Of frames that the data have in training and test the data say so.
+    trained = {*(scales.get("frames") or {}).get("names", ())} - {frame.name for frame in scene.train.frames}
     if seen := [frame.name for frame in scene.test.frames if frame.name in trained]:
         log.warning(
             "%d of the %d test images of scene '%s' were trained on (%s): their scores, and intervals that are fitted to such "
