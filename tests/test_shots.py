@@ -12,7 +12,7 @@ import pytest
 import torch
 from weathered import CAMERA, make_scene
 
-from heatsplat.contracts import SceneError, View, ViewSet
+from heatsplat.contracts import Frame, SceneError, View, ViewSet
 from heatsplat.io.tiff import read_temperature
 from heatsplat.shots import (
     ShotFiles,
@@ -113,6 +113,18 @@ def test_a_still_shows_the_moment_of_its_view_and_a_film_the_record():
     assert shot_frames(scene, "view", 5.0, 1, 1)[0].time_s == 5.0
 
 
+def test_given_cameras_are_seen_at_their_own_times_or_at_those_that_are_asked_for():
+    scene = make_scene()
+    first, second = scene.train.frames[:2]
+    cameras = [Frame("a.png", 0, first.camera, 3600.0), Frame("b.png", 1, second.camera.resized(20, 10))]
+    shot = shot_frames(scene, "cameras", cameras=cameras)
+    assert [frame.time_s for frame in shot] == [3600.0, scene.middle_s]
+    assert [frame.name for frame in shot] == ["a.png", "b.png"] and shot[1].camera is cameras[1].camera
+    assert not {frame.frame_id for frame in shot} & {frame.frame_id for frame in scene.frames}
+    assert shot[0].environment == scene.weather.at(3600.0)
+    assert [frame.time_s for frame in shot_frames(scene, "cameras", [0.0, 60.0], cameras=cameras)] == [0.0, 60.0]
+
+
 def test_a_figure_names_the_view_its_moment_and_the_clock(tmp_path):
     scene = make_scene()
     weather = replace(scene.weather, notes={"utc_at_zero_s": 1722965689.0})
@@ -207,7 +219,7 @@ def test_every_training_view_is_a_sighting_on_a_coarse_grid():
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ({"trajectory": "circle"}, "trajectory must be one of orbit, path, test, train, view, got 'circle'"),
+        ({"trajectory": "circle"}, "trajectory must be one of orbit, path, test, train, view, cameras, got 'circle'"),
         ({"time": "abc"}, "time must be a number, got abc"),
         ({"time": float("nan")}, "time must be a number, got nan"),
         ({"time": []}, "time must be a number of seconds"),

@@ -50,8 +50,13 @@ class Transforms:
         return checked_pose(self.values.get("applied_transform", np.eye(4)), f"{self.path}: applied_transform")
 
 
-def read_transforms(path: Path) -> Transforms:
-    """A transforms file. Raises SceneError naming file and key when frames are missing or incomplete."""
+def read_transforms(path: Path, unnamed: str = "") -> Transforms:
+    """A transforms file. Raises SceneError naming file and key when frames are missing or incomplete.
+
+    Args:
+        path: the file.
+        unnamed: file_path of frames without one, with a place for their number, such as "camera_{:04d}.png"; empty refuses them.
+    """
     values = json_object(path)
     frames = values.pop("frames", None)
     if not frames or not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
@@ -59,6 +64,7 @@ def read_transforms(path: Path) -> Transforms:
     used: set[str] = set()
     for i, frame in enumerate(frames):
         thermal, visible = (_path_in(frame, keys, used) for keys in (THERMAL_KEYS, VISIBLE_KEYS))
+        visible = visible or (None if thermal else unnamed.format(i))
         for key, there in (("file_path", thermal or visible), ("transform_matrix", "transform_matrix" in frame)):
             if not there:
                 has = f"{shortened(frame[key])} under" if key in frame else "no key"

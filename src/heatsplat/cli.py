@@ -307,6 +307,12 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 
     shot = {key: config[key] for key in ("trajectory", "time", "view")} | {"count": config["frames"]}
     check_shot(**shot)
+    if (config["trajectory"] == "cameras") != (config["camera_file"] is not None):
+        raise SceneError(
+            f"trajectory={config['trajectory']} with camera_file={config['camera_file'] or 'null'}: a file of cameras "
+            "is rendered by trajectory=cameras camera_file=FILE"
+        )
+    listed = build(config["listed"])
     checked_range(config["range_c"], "range_c")
     check_numbers("fps", config["fps"], error=SceneError, above=0)
     names = [config["images"]] if isinstance(config["images"], str) else config["images"]
@@ -318,7 +324,8 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     if config["video"]:
         encoder(config["codec"])  # what is missing is told before anything is rendered
     trained = _load(config, output_dir)
-    frames = shot_frames(trained.scene, **shot, finer=trained.module.supersample)
+    cameras = listed.in_scene(trained.scene)
+    frames = shot_frames(trained.scene, **shot, finer=trained.module.supersample, cameras=cameras)
     warn_beyond_record(trained.scene, frames, trained.module.thermal.beyond_record)
     for name in names:
         check_option("images", name, ("all", *trained.image_names), SceneError)

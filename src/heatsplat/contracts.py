@@ -411,6 +411,14 @@ class SceneData:
         return torch.tensor(self.notes.get("origin", (0.0, 0.0, 0.0)), dtype=torch.float64)
 
     @property
+    def clock_at_zero_s(self) -> float | None:
+        """Second 0 of the record in seconds since 1970, by the clock of the weather or else of the camera; None where none is
+        known."""
+        if self.weather is not None:
+            return self.weather.notes.get("utc_at_zero_s")
+        return self.notes.get("clock_at_zero_s")
+
+    @property
     def distance(self) -> float:
         """Median distance between the training cameras and the middle of the points, in world units."""
         centers = torch.stack([frame.camera.center for frame in self.train.frames])

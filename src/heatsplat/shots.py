@@ -25,7 +25,7 @@ log = logging.getLogger("heatsplat")
 
 DEVIATION = "viridis"  # colours of standard deviations: not those of temperatures
 
-TRAJECTORIES = ("orbit", "path", "test", "train", "view")
+TRAJECTORIES = ("orbit", "path", "test", "train", "view", "cameras")
 UNSEEN = ("nan", "keep")  # what becomes of pixels that no training view has seen
 
 
@@ -36,19 +36,22 @@ def shot_frames(
     view: int | str = 0,
     count: int = 60,
     finer: int = 1,
+    cameras: Sequence[Frame] = (),
 ) -> list[Frame]:
     """The frames of a shot, in order.
 
     Args:
         scene: whose cameras and record of time are meant.
         trajectory: "orbit" around the scene, "path" smoothly through the training cameras, "test" or "train" as taken,
-            or "view", one camera that stands still.
+            "view", one camera that stands still, or "cameras", those that are given.
         time: seconds since the first training frame; [start, end] lets time pass over the shot; None takes the time of
             each view (test, train), the whole record (view; for a single frame when the view was taken) or its middle (orbit,
-            path).
+            path, and cameras without one).
         view: for "view": position among the training frames, or file name.
         count: frames of "orbit", "path" and "view".
-        finer: how many of their pixels lie beside one of a training image (super-resolution); "test" and "train" are as taken.
+        finer: how many of their pixels lie beside one of a training image (super-resolution); "test", "train" and "cameras" are
+            as they are.
+        cameras: those of "cameras", in the world and on the clock of the scene; a time of None is not known.
 
     Raises:
         SceneError: a setting that ``check_shot`` refuses, an unknown view, or no orbit where all cameras look along one line.
@@ -59,6 +62,13 @@ def shot_frames(
         taken = getattr(scene, trajectory).frames
         moments = [frame.time_s for frame in taken] if time is None else _moments(time, len(taken))
         return [at_time(scene, frame, moment) for frame, moment in zip(taken, moments, strict=True)]
+    if trajectory == "cameras":
+        own = [scene.middle_s if frame.time_s is None else frame.time_s for frame in cameras]
+        moments = own if time is None else _moments(time, len(cameras))
+        return [
+            at_time(scene, Frame(frame.name, first_free + i, frame.camera), moment)
+            for i, (frame, moment) in enumerate(zip(cameras, moments, strict=True))
+        ]
     name = PurePosixPath(trajectory)
     if trajectory == "view":
         still = viewed(scene, view)

@@ -18,14 +18,18 @@ import cv2
 import hydra
 import numpy as np
 import pytest
+import torch
 from commands import succeeds
 from hydra._internal.utils import get_args_parser
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 from running import LOOKS, NO_PICTURES
 
+import heatsplat
 from heatsplat import cli, composition
 from heatsplat.contracts import SceneError
+from heatsplat.geometry.transforms import OPENGL_AXES
+from heatsplat.io.tiff import read_temperature
 from heatsplat.runs.lock import OccupiedError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -173,6 +177,14 @@ def test_a_sweep_over_a_checkpoint_stays_with_its_run(script, folder, tmp_path):
         ("images=[]", "images must be all, or one or a list of recorded, clean and rgb"),
         ("images=3", "images must be all, or one or a list of recorded, clean and rgb, got 3"),
         ("unseen=show", "unseen must be one of nan, keep"),
+        (
+            "camera_file=a.json",
+            "trajectory=orbit with camera_file=a.json: a file of cameras is rendered by trajectory=cameras",
+        ),
+        (
+            "trajectory=cameras",
+            "trajectory=cameras with camera_file=null: a file of cameras is rendered by trajectory=cameras cam",
+        ),
         ("threads=0", "threads must be 1 to .* on this machine, or null for all cores, got 0"),
         ("threads=abc", "threads must be 1 to .* got abc"),
     ],
@@ -202,6 +214,23 @@ def test_render_writes_temperatures_pictures_and_a_video(finished, told):
     celsius = cv2.imread(str(tiffs[0]), cv2.IMREAD_UNCHANGED)
     assert celsius.dtype == "float32" and 10 < np.nanmean(celsius) < 80
     assert (folder / "video.mp4").stat().st_size > 1000
+
+
+def test_render_shows_what_the_cameras_of_a_file_see(finished, told, tmp_path):
+    trained = heatsplat.load(finished / "checkpoints" / "last.ckpt")
+    scene, frame = trained.scene, trained.scene.train.frames[0]
+    pose = torch.linalg.inv(frame.camera.viewmat) @ torch.from_numpy(OPENGL_AXES)
+    lens = {"w": frame.camera.width, "h": frame.camera.height, "fl_x": frame.camera.K[0, 0].item()}
+    listed = [{"transform_matrix": pose.tolist(), "time_s": 0.0}, {"transform_matrix": pose.tolist()}]
+    (tmp_path / "mine.json").write_text(json.dumps({**lens, "frames": listed}))
+    told(
+        "render", f"ckpt={finished}", "trajectory=cameras", "camera_file=mine.json", "video=false", "png=false", cwd=tmp_path,
+    )  # fmt: skip
+    (folder,) = finished.glob("views/cameras_*")
+    rows = [row.split(",") for row in (folder / "frames.csv").read_text().splitlines()[1:]]
+    assert [(row[0], float(row[1])) for row in rows] == [("camera_0000", 0.0), ("camera_0001", scene.middle_s)]
+    celsius = read_temperature(folder / "tiff" / "camera_0000.tiff")
+    np.testing.assert_allclose(celsius, trained.render(frame.camera, 0.0), atol=1e-3)
 
 
 def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path, told, monkeypatch):

@@ -16,6 +16,7 @@ from viewer.test_payload import in_units
 
 from heatsplat.callbacks.viewer import ViewerPage
 from heatsplat.contracts import SceneError, ViewSet, evenly_spread
+from heatsplat.datamodules.listed_cameras import ListedCameras
 from heatsplat.io.tables import read_csv
 from heatsplat.renderers.settings import Renderer
 from heatsplat.runs.run import load
@@ -379,6 +380,35 @@ def test_curves_and_the_picture_can_be_kept(page):
       const one = kept.getContext('2d').getImageData(0, 0, shown.width, shown.height).data;
       return [kept.width - shown.width, kept.height - shown.height, new Set(one).size];""")
     assert kept[0] == 0 and kept[1] > 20 and kept[2] > 50
+
+
+def test_the_camera_can_be_kept_and_rendered(page, trained, tmp_path):
+    """It has the pixels of the canvas."""
+    told = page.execute_script("""viewer.goTo(0); viewer.turn(0.3, 0.1); viewer.nearer(1);
+      viewer.setTime(0.4 * viewer.told.span[1]);
+      viewer.told.origin = [5e5, 4e6, 0];
+      const kept = [], keep = viewer.keep;
+      viewer.keep = (name, blob) => kept.push(name);
+      document.getElementById("saveCamera").click();
+      viewer.keep = keep;
+      const file = viewer.cameraFile();
+      viewer.told.origin = null;
+      const { camera, scale, left, top } = viewer.view, { width, height } = document.getElementById("canvas");
+      const at = [0.3, 0.6].map((share) => [share * width, share * height]);
+      return [kept, file, at,
+        at.map(([x, y]) => camera.point((x - left) / scale, (y - top) / scale, 2.0)), viewer.state.time];""")
+    kept, text, pixels, points, time_s = told
+    assert kept == [f"{trained.scene.name}_{trained.module.config['name']}_camera.json"]
+    (tmp_path / "camera.json").write_text(text)
+    scene = replace(trained.scene, notes={**trained.scene.notes, "origin": [5e5, 4e6, 0.0]})
+    (frame,) = ListedCameras(tmp_path / "camera.json").in_scene(scene)
+    assert frame.time_s == pytest.approx(time_s)
+    projected, depths = frame.camera.project(torch.tensor(points, dtype=torch.float64))
+    assert projected.numpy() == pytest.approx(np.array(pixels), abs=1e-3) and depths.numpy() == pytest.approx(
+        2.0, abs=1e-6
+    )
+    image = trained.render(frame.camera, frame.time_s, unseen="keep")
+    assert image.shape == (frame.camera.height, frame.camera.width)
 
 
 def test_colours_are_those_of_both_sides_of_another_time(page):

@@ -89,13 +89,10 @@ class Clock:
 
 
 def clock_of(scene: SceneData) -> Clock | None:
-    """The clock of a scene's record: that of the weather, or of the camera (``notes["clock_at_zero_s"]``); None where none is
+    """The clock of a scene's record (``SceneData.clock_at_zero_s``), in UTC where it is that of the weather; None where none is
     known."""
-    if scene.weather is not None:
-        known = scene.weather.notes.get("utc_at_zero_s")
-        return None if known is None else Clock(known)
-    known = scene.notes.get("clock_at_zero_s")
-    return None if known is None else Clock(known, zone="")
+    known = scene.clock_at_zero_s
+    return None if known is None else Clock(known, "" if scene.weather is None else "UTC")
 
 
 def moment(time_s: float, clock: Clock | None = None) -> str:

@@ -149,6 +149,7 @@ class Controls {
   listenToFiles() {
     const { viewer } = this;
     $("save").onclick = () => viewer.picturePage().toBlob((blob) => viewer.keep(`${viewer.stem}.png`, blob));
+    $("saveCamera").onclick = () => viewer.keep(`${viewer.stem}_camera.json`, new Blob([viewer.cameraFile()], { type: "application/json" }));
     $("curves").onclick = () => viewer.keep(`${viewer.stem}_probes.csv`, new Blob([viewer.probes.table()], { type: "text/csv" }));
     $("areasTable").onclick = () => viewer.keep(`${viewer.stem}_areas.csv`, new Blob([viewer.areas.table()], { type: "text/csv" }));
     $("run").onchange = () => $("run").files[0] && viewer.openRun($("run").files[0]);

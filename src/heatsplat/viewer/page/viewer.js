@@ -529,6 +529,17 @@ class Viewer {
     return `${this.told.scene}_${this.told.method}`.replace(/[^\w.-]+/g, "_");
   }
 
+  // What the canvas shows, as a transforms.json of one camera in the world of the data: src/render.py makes the same picture of it.
+  cameraFile() {
+    const { camera, scale, left, top } = this.view, { width, height } = $("canvas"), [fx, fy, cx, cy] = camera.intrinsics;
+    const origin = this.told.origin || [0, 0, 0], place = plus(camera.centre, origin);
+    const rows = [0, 1, 2].map((i) => [camera.right[i], -camera.down[i], -camera.forward[i], place[i]]);  // OpenGL: y up, z back
+    const frame = { file_path: `${this.stem}_camera.png`, transform_matrix: [...rows, [0, 0, 0, 1]] };
+    if (this.told.span) frame.time_s = this.state.time;
+    const lens = { w: width, h: height, fl_x: fx * scale, fl_y: fy * scale, cx: cx * scale + left, cy: cy * scale + top };
+    return `${JSON.stringify({ camera_model: "PINHOLE", ...lens, frames: [frame] }, null, 2)}\n`;
+  }
+
   // The picture with its marks and, below it, the scale and the time: a canvas.
   picturePage() {
     const shown = $("canvas"), ratio = shown.width / shown.clientWidth, page = document.createElement("canvas");
