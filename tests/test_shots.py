@@ -125,6 +125,19 @@ def test_given_cameras_are_seen_at_their_own_times_or_at_those_that_are_asked_fo
     assert [frame.time_s for frame in shot_frames(scene, "cameras", [0.0, 60.0], cameras=cameras)] == [0.0, 60.0]
 
 
+def test_pictures_have_the_colours_that_were_asked_for(tmp_path):
+    scene = make_scene()
+    (frame,) = shot_frames(scene, "view", 0.0, 0, 1)
+    image = torch.linspace(0.0, 1.0, frame.camera.width).expand(frame.camera.height, -1)[..., None]
+    shown = {}
+    for name in ("inferno", "gray"):
+        files = ShotFiles(tmp_path / name, video=False)
+        write_shot([({"recorded": image}, None)], [frame], scene, files, colormap=name)
+        (path,) = (tmp_path / name / "png").glob("*.png")
+        shown[name] = cv2.imread(str(path)).astype(int)
+    assert np.ptp(shown["gray"], axis=2).max() == 0 and np.ptp(shown["inferno"], axis=2).max() > 50
+
+
 def test_a_figure_names_the_view_its_moment_and_the_clock(tmp_path):
     scene = make_scene()
     weather = replace(scene.weather, notes={"utc_at_zero_s": 1722965689.0})

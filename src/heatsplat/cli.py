@@ -302,7 +302,15 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 
     from heatsplat.export.formats.base import checked_range
     from heatsplat.io.video import CODECS, encoder
-    from heatsplat.shots import ShotFiles, check_shot, checked_unseen, shot_frames, warn_beyond_record, write_shot
+    from heatsplat.shots import (
+        ShotFiles,
+        check_shot,
+        checked_colormap,
+        checked_unseen,
+        shot_frames,
+        warn_beyond_record,
+        write_shot,
+    )
     from heatsplat.uncertainty import Uncertainty
 
     shot = {key: config[key] for key in ("trajectory", "time", "view")} | {"count": config["frames"]}
@@ -314,6 +322,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
         )
     listed = build(config["listed"])
     checked_range(config["range_c"], "range_c")
+    look = {"range_c": config["range_c"], "colormap": checked_colormap("colormap", config["colormap"])}
     check_numbers("fps", config["fps"], error=SceneError, above=0)
     names = [config["images"]] if isinstance(config["images"], str) else config["images"]
     if not isinstance(names, list) or not names:
@@ -339,7 +348,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
         uncertainty = Uncertainty(trained.module)
         uncertain = {"deviation": uncertainty.deviation, "widest": uncertainty.widest}
     files = ShotFiles(output_dir, **kinds)
-    written = write_shot(images, frames, trained.scene, files, config["range_c"], trained.image_titles, **uncertain)
+    written = write_shot(images, frames, trained.scene, files, titles=trained.image_titles, **look, **uncertain)
     log.info("%s, %s in %s", counted(len(frames), "frame"), counted(len(written), "file"), output_dir)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import difflib
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
+import matplotlib
 import numpy as np
 import torch
 from torch import Tensor
@@ -16,7 +18,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, check_count, check_numbers, check_option
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
-from heatsplat.io.pictures import Bar, Panel, bar_unit, compose, fitted, image_panel, write_figure, write_png
+from heatsplat.io.pictures import THERMAL, Bar, Panel, bar_unit, compose, fitted, image_panel, write_figure, write_png
 from heatsplat.io.quantities import clock_of, moment
 from heatsplat.io.tiff import write_temperature
 from heatsplat.io.video import video as film
@@ -112,6 +114,14 @@ def checked_unseen(name: str, value: str | float) -> str:
     word = "nan" if value != value else value
     check_option(name, word, UNSEEN, SceneError)
     return word
+
+
+def checked_colormap(name: str, value: str) -> str:
+    """A name of a matplotlib map. Raises SceneError with the option's ``name``, and names that are alike, where there is none."""
+    if value not in matplotlib.colormaps:
+        alike = difflib.get_close_matches(str(value), matplotlib.colormaps) or ["gray", "turbo", "viridis"]
+        raise SceneError(f"{name}={value} is no map of matplotlib, as {', '.join([THERMAL, *alike])} are")
+    return value
 
 
 def first_free_id(scene: SceneData) -> int:
@@ -277,6 +287,7 @@ def write_shot(
     titles: Mapping[str, str] | None = None,
     deviation: Callable[[Frame], Tensor] | None = None,
     widest: float = 1.0,
+    colormap: str = THERMAL,
 ) -> list[Path]:
     """Paths of the files written for a shot: TIFF in °C, PNG with a bar, a video of each image, and ``frames.csv``.
 
@@ -301,12 +312,13 @@ def write_shot(
         deviation: standard deviation [H, W] of each pixel of a frame in the unit of the TIFFs, which lies in tiff_uncertainty
             and png_uncertainty, also of what was not seen; None writes none.
         widest: of these, at the end of the colours.
+        colormap: name of the matplotlib map that colours temperatures (``checked_colormap``).
     """
     bounds = scene.thermal_range
     if bounds is None:
         log.warning("scene '%s' has no temperature bounds: files hold image values in [0, 1], not °C", scene.name)
     low, high = range_c or ((bounds.min_c, bounds.max_c) if bounds else (0.0, 1.0))
-    bar = Bar(low, high, bar_unit(bounds))
+    bar = Bar(low, high, bar_unit(bounds), colormap)
     stems = file_stems([frame.name for frame in frames])
     clock = clock_of(scene)
     rows: list[tuple[str, float | None, float, float]] = []

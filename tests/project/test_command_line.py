@@ -170,6 +170,7 @@ def test_a_sweep_over_a_checkpoint_stays_with_its_run(script, folder, tmp_path):
     [
         ("range_c=30", "range_c must be a list of 2 numbers, got 30"),
         ("range_c=[30,10]", "range_c must be two increasing numbers"),
+        ("colormap=virids", "colormap=virids is no map of matplotlib, as inferno, viridis.* are"),
         ("fps=0", "fps must be above 0, got 0"),
         ("fps=abc", "fps must be a number, got abc"),
         ("frames=1.5", "frames must be a whole number"),
