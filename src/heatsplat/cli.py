@@ -307,7 +307,9 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
         check_shot,
         checked_colormap,
         checked_unseen,
+        depth_beside,
         shot_frames,
+        uncertainty_beside,
         warn_beyond_record,
         write_shot,
     )
@@ -343,12 +345,14 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
         (trained.images(frame, names), None if keep else trained.seen(frame)) for frame in track(frames, "rendering")
     )
     kinds = {key: config[key] for key in ("tiff", "png", "video", "fps", "codec", "figures")}
-    uncertain = {}
+    beside = []
     if config["uncertainty"]:
         uncertainty = Uncertainty(trained.module)
-        uncertain = {"deviation": uncertainty.deviation, "widest": uncertainty.widest}
+        beside.append(uncertainty_beside(trained.scene, uncertainty.deviation, uncertainty.widest))
+    if config["depth"]:
+        beside.append(depth_beside(trained.scene, trained.depth, frames))
     files = ShotFiles(output_dir, **kinds)
-    written = write_shot(images, frames, trained.scene, files, titles=trained.image_titles, **look, **uncertain)
+    written = write_shot(images, frames, trained.scene, files, titles=trained.image_titles, beside=beside, **look)
     log.info("%s, %s in %s", counted(len(frames), "frame"), counted(len(written), "file"), output_dir)
 
 

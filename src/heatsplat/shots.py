@@ -15,7 +15,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, check_count, check_numbers, check_option
+from heatsplat.contracts import (
+    Camera,
+    Frame,
+    SceneData,
+    SceneError,
+    View,
+    check_count,
+    check_numbers,
+    check_option,
+    evenly_spread,
+    quantile,
+)
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
 from heatsplat.io.pictures import THERMAL, Bar, Panel, bar_unit, compose, fitted, image_panel, write_figure, write_png
@@ -25,7 +36,8 @@ from heatsplat.io.video import video as film
 
 log = logging.getLogger("heatsplat")
 
-DEVIATION = "viridis"  # colours of standard deviations: not those of temperatures
+DEVIATION = "viridis"  # colours of what are no temperatures
+DEPTH_POINTS, DEPTH_ENDS = 1000, (0.02, 0.98)  # points, and shares of them, by whose depths these colours end
 
 TRAJECTORIES = ("orbit", "path", "test", "train", "view", "cameras")
 UNSEEN = ("nan", "keep")  # what becomes of pixels that no training view has seen
@@ -278,6 +290,54 @@ class ShotFiles:
             write_figure(self.add(f"figures/{stem}.{self.figures}"), panels, title)
 
 
+@dataclass(frozen=True)
+class Beside:
+    """What is written of each frame beside its images, also of pixels that no training view has seen.
+
+    Args:
+        name: of its folders, tiff_<name> and png_<name>.
+        title: in pictures.
+        values: of a frame, [H, W].
+        bar: what its colours mean.
+    """
+
+    name: str
+    title: str
+    values: Callable[[Frame], Tensor]
+    bar: Bar
+
+
+def uncertainty_beside(scene: SceneData, deviation: Callable[[Frame], Tensor], widest: float) -> Beside:
+    """The standard deviation of each pixel, in the unit of the TIFFs; ``widest`` is at the end of the colours."""
+    bar = Bar(0.0, widest, bar_unit(scene.thermal_range), DEVIATION)
+    return Beside("uncertainty", f"uncertainty, {deviations_told(scene)}", deviation, bar)
+
+
+def depth_beside(scene: SceneData, depth_of: Callable[[Frame], Tensor], frames: Sequence[Frame]) -> Beside:
+    """Camera z of the surface in each pixel, NaN where there is none: in metres where the scene has a scale, else in its units.
+
+    Args:
+        scene: whose points in the frames say what is at the ends of the colours.
+        depth_of: camera z [H, W] of a frame in world units, infinite where there is no surface.
+        frames: that are shown.
+    """
+    scale, unit = (1.0, "units") if scene.metres_per_unit is None else (scene.metres_per_unit, "m")
+    points, found = scene.points[evenly_spread(len(scene.points), DEPTH_POINTS)], []
+    for frame in frames:
+        pixels, depths = frame.camera.project(points)
+        size = pixels.new_tensor([frame.camera.width, frame.camera.height])
+        found.append(depths[(depths > 0) & (pixels > 0).all(1) & (pixels < size).all(1)])
+    seen = torch.cat(found)
+    seen = seen if len(seen) else seen.new_tensor([scene.distance])  # no point is in sight
+    low, high = (scale * quantile(seen, seen.new_tensor(DEPTH_ENDS))).tolist()
+
+    def values(frame: Frame) -> Tensor:
+        depth = scale * depth_of(frame)
+        return torch.where(depth.isfinite(), depth, torch.nan)
+
+    return Beside("depth", "depth", values, Bar(low, high if high > low else 2.0 * low, unit, DEVIATION))
+
+
 def write_shot(
     images: Iterable[tuple[Mapping[str, Tensor], Tensor | None]],
     frames: Sequence[Frame],
@@ -285,8 +345,7 @@ def write_shot(
     files: ShotFiles,
     range_c: Sequence[float] | None = None,
     titles: Mapping[str, str] | None = None,
-    deviation: Callable[[Frame], Tensor] | None = None,
-    widest: float = 1.0,
+    beside: Sequence[Beside] = (),
     colormap: str = THERMAL,
 ) -> list[Path]:
     """Paths of the files written for a shot: TIFF in °C, PNG with a bar, a video of each image, and ``frames.csv``.
@@ -309,9 +368,7 @@ def write_shot(
         files: which of them are wanted, and where.
         range_c: °C at the ends of the colours; None takes the scene's range.
         titles: of images in pictures, by name; others have their name.
-        deviation: standard deviation [H, W] of each pixel of a frame in the unit of the TIFFs, which lies in tiff_uncertainty
-            and png_uncertainty, also of what was not seen; None writes none.
-        widest: of these, at the end of the colours.
+        beside: what else is written of each frame.
         colormap: name of the matplotlib map that colours temperatures (``checked_colormap``).
     """
     bounds = scene.thermal_range
@@ -339,17 +396,11 @@ def write_shot(
                 if image.shape[-1] == 1:
                     files.add_values(suffix, stem, (bounds.to_celsius(values) if bounds else values)[..., 0])
                 files.add_picture(suffix, stem, _with(panels[-1], limits), title)
-            if deviation is not None:
-                spread = deviation(frame)
-                panels.append(
-                    image_panel(
-                        spread[..., None],
-                        f"uncertainty, {deviations_told(scene)}",
-                        Bar(0.0, widest, bar.unit, DEVIATION),
-                    )
-                )
-                files.add_values("_uncertainty", stem, spread)
-                files.add_picture("_uncertainty", stem, _with(panels[-1], limits), title, moving=False)
+            for one in beside:
+                values = one.values(frame)
+                panels.append(image_panel(values[..., None], one.title, one.bar))
+                files.add_values(f"_{one.name}", stem, values)
+                files.add_picture(f"_{one.name}", stem, _with(panels[-1], limits), title, moving=False)
             files.add_figure(stem, panels, "   ".join([title, *limits]))
     _write_table(files.add("frames.csv"), rows)
     return files.written

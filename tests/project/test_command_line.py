@@ -225,13 +225,18 @@ def test_render_shows_what_the_cameras_of_a_file_see(finished, told, tmp_path):
     listed = [{"transform_matrix": pose.tolist(), "time_s": 0.0}, {"transform_matrix": pose.tolist()}]
     (tmp_path / "mine.json").write_text(json.dumps({**lens, "frames": listed}))
     told(
-        "render", f"ckpt={finished}", "trajectory=cameras", "camera_file=mine.json", "video=false", "png=false", cwd=tmp_path,
+        "render", f"ckpt={finished}", "trajectory=cameras", "camera_file=mine.json", "video=false", "png=false", "depth=true",
+        cwd=tmp_path,
     )  # fmt: skip
     (folder,) = finished.glob("views/cameras_*")
     rows = [row.split(",") for row in (folder / "frames.csv").read_text().splitlines()[1:]]
     assert [(row[0], float(row[1])) for row in rows] == [("camera_0000", 0.0), ("camera_0001", scene.middle_s)]
     celsius = read_temperature(folder / "tiff" / "camera_0000.tiff")
     np.testing.assert_allclose(celsius, trained.render(frame.camera, 0.0), atol=1e-3)
+    depth = read_temperature(folder / "tiff_depth" / "camera_0000.tiff")
+    np.testing.assert_allclose(
+        depth, scene.metres_per_unit * trained.depth(frame).nan_to_num(np.nan, np.nan), rtol=1e-5
+    )
 
 
 def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path, told, monkeypatch):
