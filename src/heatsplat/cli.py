@@ -301,6 +301,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     from rich.progress import track
 
     from heatsplat.export.formats.base import checked_range
+    from heatsplat.export.place import placed, unit_in_metres
     from heatsplat.io.video import CODECS, encoder
     from heatsplat.shots import (
         ShotFiles,
@@ -350,7 +351,8 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
         uncertainty = Uncertainty(trained.module)
         beside.append(uncertainty_beside(trained.scene, uncertainty.deviation, uncertainty.widest))
     if config["depth"]:
-        beside.append(depth_beside(trained.scene, trained.depth, frames))
+        metres = unit_in_metres(trained.scene, placed(trained.scene))
+        beside.append(depth_beside(trained.scene, trained.depth, frames, metres))
     files = ShotFiles(output_dir, **kinds)
     written = write_shot(images, frames, trained.scene, files, titles=trained.image_titles, beside=beside, **look)
     log.info("%s, %s in %s", counted(len(frames), "frame"), counted(len(written), "file"), output_dir)

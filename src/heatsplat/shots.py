@@ -37,7 +37,8 @@ from heatsplat.io.video import video as film
 log = logging.getLogger("heatsplat")
 
 DEVIATION = "viridis"  # colours of what are no temperatures
-DEPTH_POINTS, DEPTH_ENDS = 1000, (0.02, 0.98)  # points, and shares of them, by whose depths these colours end
+# Points, and shares of them, by whose depths these colours end; and by which share of a depth they go beyond.
+DEPTH_POINTS, DEPTH_ENDS, DEPTH_MARGIN = 1000, (0.02, 0.98), 0.1
 
 TRAJECTORIES = ("orbit", "path", "test", "train", "view", "cameras")
 UNSEEN = ("nan", "keep")  # what becomes of pixels that no training view has seen
@@ -313,15 +314,18 @@ def uncertainty_beside(scene: SceneData, deviation: Callable[[Frame], Tensor], w
     return Beside("uncertainty", f"uncertainty, {deviations_told(scene)}", deviation, bar)
 
 
-def depth_beside(scene: SceneData, depth_of: Callable[[Frame], Tensor], frames: Sequence[Frame]) -> Beside:
-    """Camera z of the surface in each pixel, NaN where there is none: in metres where the scene has a scale, else in its units.
+def depth_beside(
+    scene: SceneData, depth_of: Callable[[Frame], Tensor], frames: Sequence[Frame], metres_per_unit: float | None
+) -> Beside:
+    """Camera z of the surface in each pixel, NaN where there is none: in metres where the scale is known, else in world units.
 
     Args:
         scene: whose points in the frames say what is at the ends of the colours.
         depth_of: camera z [H, W] of a frame in world units, infinite where there is no surface.
         frames: that are shown.
+        metres_per_unit: of the world; None where nobody knows.
     """
-    scale, unit = (1.0, "units") if scene.metres_per_unit is None else (scene.metres_per_unit, "m")
+    scale, unit = (1.0, "units") if metres_per_unit is None else (metres_per_unit, "m")
     points, found = scene.points[evenly_spread(len(scene.points), DEPTH_POINTS)], []
     for frame in frames:
         pixels, depths = frame.camera.project(points)
@@ -330,12 +334,16 @@ def depth_beside(scene: SceneData, depth_of: Callable[[Frame], Tensor], frames: 
     seen = torch.cat(found)
     seen = seen if len(seen) else seen.new_tensor([scene.distance])  # no point is in sight
     low, high = (scale * quantile(seen, seen.new_tensor(DEPTH_ENDS))).tolist()
+    low, high = (
+        (1.0 - DEPTH_MARGIN) * low,
+        (1.0 + DEPTH_MARGIN) * high,
+    )  # rendered surfaces of flat ground lie beside it
 
     def values(frame: Frame) -> Tensor:
         depth = scale * depth_of(frame)
         return torch.where(depth.isfinite(), depth, torch.nan)
 
-    return Beside("depth", "depth", values, Bar(low, high if high > low else 2.0 * low, unit, DEVIATION))
+    return Beside("depth", "depth", values, Bar(low, high, unit, DEVIATION))
 
 
 def write_shot(
