@@ -35,7 +35,7 @@ def test_settings_in_commands_are_keys_of_a_command():
     keys = {*CONFIG, *compose([], "render"), "method", "preset", "recipe", "hydra"}
     given = {word.partition("=")[0] for name in NAMED for word in name.split() if re.match(r"[a-z_.]+=[^\"]", word)}
     wrong = {key for key in given if key.split(".")[0] not in keys}
-    assert wrong == {"antialiased", "camera", "depth", "modality_channels"}  # arguments in Python
+    assert wrong == {"antialiased", "camera", "modality_channels"}  # arguments in Python
 
 
 @pytest.mark.parametrize("key", PUBLISHED)
