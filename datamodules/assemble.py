@@ -206,7 +206,7 @@ def _split(
     if both := sorted(set(train) & set(test)):
         notes["split_in_both"] = f"{counted(len(both), 'test frame')} trained on, too: {FITTED}"
     if rule.rule == ALL:
-        log.info("data.split=all: no frame is held out, and %s", notes["split_in_both"])
+        log.info("data.split=all: every frame is for training; %s", notes["split_in_both"])
     elif both:
         log.warning(
             "data.split=%s: training and test have %s in common (%s), so that scores flatter the run; name each in one list",

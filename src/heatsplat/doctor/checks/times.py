@@ -48,7 +48,8 @@ def find(material: Material) -> list[Finding]:
                 "times",
                 0.02,
                 f"{same} frames have the time of another one.",
-                "Give times with fractions of a second (data.time_csv); methods of time cannot tell these apart.",
+                "Give times with fractions of a second (data=colmap and nerfstudio take data.time_csv); methods of time cannot "
+                "tell these apart.",
             )
         )
     usual = float(steps[steps > 0].median()) if (steps > 0).any() else 0.0
