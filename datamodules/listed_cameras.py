@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
@@ -20,32 +22,33 @@ log = logging.getLogger(__name__)
 
 
 class ListedCameras:
-    """The cameras of a file or folder, in its order.
+    """The cameras of files and folders, in their order.
 
     Args:
-        path: transforms.json (camera-to-world matrices in OpenGL axes; w, h and fl_x or camera_angle_x; where a camera has a
-            time, time_s in seconds since the first training frame, or a date-time; names under file_path, which may be left
-            out), or a folder with a COLMAP model; in the world of the data set. None lists none.
+        path: one or a list of transforms.json and folders with a COLMAP model, in the world of the data set; None lists none. A
+            transforms.json has camera-to-world matrices in OpenGL axes, w, h and fl_x or camera_angle_x, and where a camera has a
+            time time_s in seconds since the first training frame, or a date-time; names (file_path) may be left out.
 
     Attributes:
-        frames: in the world of the data set; ``frame_id`` is their number in the file. Times are seconds since the first training
-            frame, or from 1e8 on since 1970; None where a camera has none.
+        frames: in the world of the data set; ``frame_id`` is their number, which also stands in names that several have. Times
+            are seconds since the first training frame, or from 1e8 on since 1970; None where a camera has none.
 
     Raises:
         SceneError: there are none, or one is no camera. File and key are named.
     """
 
-    def __init__(self, path: str | Path | None = None) -> None:
+    def __init__(self, path: str | Path | Sequence[str | Path] | None = None) -> None:
         self.frames: list[Frame] = []
-        if path is None:
-            return
-        source = Path(path).expanduser()
-        found = _of_model(source) if source.is_dir() else _of_transforms(source)
-        if any(lens.is_distorted for _, _, lens, _ in found):
-            log.warning("camera_file=%s: lenses distort; images are rendered as by lenses that do not", path)
-        for i, (name, pose, lens, time_s) in enumerate(found):
-            camera = Camera(torch.as_tensor(pose), torch.from_numpy(lens.matrix()), lens.width, lens.height)
-            self.frames.append(Frame(name, i, camera, time_s))
+        for one in [path] if isinstance(path, str | Path) else path or ():
+            source = Path(one).expanduser()
+            found = _of_model(source) if source.is_dir() else _of_transforms(source)
+            if any(lens.is_distorted for _, _, lens, _ in found):
+                log.warning("camera_file=%s: lenses distort; images are rendered as by lenses that do not", one)
+            for name, pose, lens, time_s in found:
+                camera = Camera(torch.as_tensor(pose), torch.from_numpy(lens.matrix()), lens.width, lens.height)
+                self.frames.append(Frame(name, len(self.frames), camera, time_s))
+        alike = Counter(frame.name for frame in self.frames)
+        self.frames = [_numbered(frame) if alike[frame.name] > 1 else frame for frame in self.frames]
 
     def in_scene(self, scene: SceneData) -> list[Frame]:
         """The frames in the world and on the clock of a scene that was loaded of the data set.
@@ -91,6 +94,11 @@ def _of_model(folder: Path) -> list[tuple[str, Any, Lens, float | None]]:
         raise SceneError(f"camera_file={folder} holds no COLMAP model; give its folder, or a transforms.json itself")
     model = read_model_of(found)
     return [(*one, None) for one in zip(model.names, model.viewmats, model.lenses, strict=True)]
+
+
+def _numbered(frame: Frame) -> Frame:
+    path = PurePosixPath(frame.name)
+    return replace(frame, name=str(path.with_stem(f"{path.stem}_{frame.frame_id:04d}")))
 
 
 def _about(camera: Camera, origin: torch.Tensor) -> Camera:

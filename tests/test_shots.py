@@ -126,6 +126,19 @@ def test_given_cameras_are_seen_at_their_own_times_or_at_those_that_are_asked_fo
     assert [frame.time_s for frame in shot_frames(scene, "cameras", [0.0, 60.0], cameras=cameras)] == [0.0, 60.0]
 
 
+def test_a_path_leads_through_given_cameras_and_their_times():
+    scene = make_scene()
+    first, second = (frame.camera for frame in scene.train.frames[:2])
+    cameras = [Frame("a.png", 0, first, 600.0), Frame("b.png", 1, second, 0.0)]
+    path = shot_frames(scene, "path", count=3, cameras=cameras)
+    assert [frame.time_s for frame in path] == [600.0, 300.0, 0.0]
+    assert torch.allclose(path[0].camera.viewmat, first.viewmat) and torch.allclose(
+        path[2].camera.viewmat, second.viewmat
+    )
+    timeless = [replace(frame, time_s=None) for frame in cameras]
+    assert {frame.time_s for frame in shot_frames(scene, "path", count=3, cameras=timeless)} == {scene.middle_s}
+
+
 @pytest.mark.parametrize(("metres_per_unit", "scale", "unit"), [(None, 1.0, "units"), (20.0, 20.0, "m")])
 def test_depth_is_in_metres_where_the_scene_has_a_scale_and_nan_where_there_is_no_surface(
     tmp_path, metres_per_unit, scale, unit

@@ -318,10 +318,11 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 
     shot = {key: config[key] for key in ("trajectory", "time", "view")} | {"count": config["frames"]}
     check_shot(**shot)
-    if (config["trajectory"] == "cameras") != (config["camera_file"] is not None):
+    given = config["camera_file"] is not None
+    if given != (config["trajectory"] == "cameras") and not (given and config["trajectory"] == "path"):
         raise SceneError(
-            f"trajectory={config['trajectory']} with camera_file={config['camera_file'] or 'null'}: a file of cameras "
-            "is rendered by trajectory=cameras camera_file=FILE"
+            f"trajectory={config['trajectory']} with camera_file={config['camera_file'] or 'null'}: cameras of a file are "
+            "rendered by trajectory=cameras camera_file=FILE, or a smooth path through them by trajectory=path camera_file=FILE"
         )
     listed = build(config["listed"])
     checked_range(config["range_c"], "range_c")

@@ -57,16 +57,16 @@ def shot_frames(
 
     Args:
         scene: whose cameras and record of time are meant.
-        trajectory: "orbit" around the scene, "path" smoothly through the training cameras, "test" or "train" as taken,
-            "view", one camera that stands still, or "cameras", those that are given.
+        trajectory: "orbit" around the scene, "path" smoothly through given cameras or else those of training, "test" or "train"
+            as taken, "view", one camera that stands still, or "cameras", those that are given.
         time: seconds since the first training frame; [start, end] lets time pass over the shot; None takes the time of
             each view (test, train), the whole record (view; for a single frame when the view was taken) or its middle (orbit,
-            path, and cameras without one).
+            path, and cameras without one); along a path through given cameras that have times it passes as theirs do.
         view: for "view": position among the training frames, or file name.
         count: frames of "orbit", "path" and "view".
         finer: how many of their pixels lie beside one of a training image (super-resolution); "test", "train" and "cameras" are
             as they are.
-        cameras: those of "cameras", in the world and on the clock of the scene; a time of None is not known.
+        cameras: those of "cameras" and "path", in the world and on the clock of the scene; a time of None is not known.
 
     Raises:
         SceneError: a setting that ``check_shot`` refuses, an unknown view, or no orbit where all cameras look along one line.
@@ -84,21 +84,26 @@ def shot_frames(
             at_time(scene, Frame(frame.name, first_free + i, frame.camera), moment)
             for i, (frame, moment) in enumerate(zip(cameras, moments, strict=True))
         ]
-    name = PurePosixPath(trajectory)
+    name, moments = PurePosixPath(trajectory), None
     if trajectory == "view":
         still = viewed(scene, view)
-        cameras, name = trajectories.fixed_view(still.camera, count), PurePosixPath(still.name)
+        shown, name = trajectories.fixed_view(still.camera, count), PurePosixPath(still.name)
         record = [t for t in scene.train.times_s if t is not None]
         if time is None and record:
             time = still.time_s if count == 1 else (min(record), max(record))
     else:
-        cameras = _moving(scene, trajectory, count)
+        shown = _moving(scene, trajectory, count, cameras)
+        own = [frame.time_s for frame in cameras] if trajectory == "path" else []
+        if (
+            time is None and own and None not in own
+        ):  # equal shares of the frames between neighbours, as their places have
+            moments = np.interp(np.linspace(0, len(own) - 1, count), range(len(own)), own).tolist()
         time = scene.middle_s if time is None else time
-    cameras = [camera.resized(finer * camera.width, finer * camera.height) for camera in cameras]
-    moments = [None] * count if time is None else _moments(time, count)
+    shown = [camera.resized(finer * camera.width, finer * camera.height) for camera in shown]
+    moments = moments or ([None] * count if time is None else _moments(time, count))
     return [
         at_time(scene, Frame(str(name.with_stem(f"{name.stem}_{i:04d}")), first_free + i, camera), moment)
-        for i, (camera, moment) in enumerate(zip(cameras, moments, strict=True))
+        for i, (camera, moment) in enumerate(zip(shown, moments, strict=True))
     ]
 
 
@@ -149,12 +154,11 @@ def at_time(scene: SceneData, frame: Frame, moment: float | None) -> Frame:
     return replace(frame, time_s=moment, environment=None if moment is None else scene.weather.at(moment))
 
 
-def _moving(scene: SceneData, trajectory: str, count: int) -> list[Camera]:
-    taken = [frame.camera for frame in scene.train.frames]
+def _moving(scene: SceneData, trajectory: str, count: int, given: Sequence[Frame]) -> list[Camera]:
     if trajectory == "path":
-        return trajectories.interpolate(taken, count)
+        return trajectories.interpolate([frame.camera for frame in given or scene.train.frames], count)
     try:
-        return trajectories.orbit(taken, count)
+        return trajectories.orbit([frame.camera for frame in scene.train.frames], count)
     except ValueError as error:
         raise SceneError(str(error)) from error
 

@@ -35,6 +35,15 @@ def test_cameras_of_a_transforms_file_need_neither_names_nor_images(tmp_path):
     assert second.camera.K[0, 0] == 76.0
 
 
+def test_several_files_stand_one_after_the_other(tmp_path):
+    paths = [tmp_path / name / "camera.json" for name in "ab"]
+    for path in paths:
+        path.parent.mkdir()
+        written(path.parent, {"file_path": "view.png"}).rename(path)
+    frames = ListedCameras([str(path) for path in paths]).frames
+    assert [(frame.name, frame.frame_id) for frame in frames] == [("view_0000.png", 0), ("view_0001.png", 1)]
+
+
 @pytest.mark.parametrize("inner", ["", "sparse/0"])
 def test_cameras_of_a_colmap_model(tmp_path, inner):
     write_colmap(tmp_path, names(3))

@@ -180,11 +180,11 @@ def test_a_sweep_over_a_checkpoint_stays_with_its_run(script, folder, tmp_path):
         ("unseen=show", "unseen must be one of nan, keep"),
         (
             "camera_file=a.json",
-            "trajectory=orbit with camera_file=a.json: a file of cameras is rendered by trajectory=cameras",
+            "trajectory=orbit with camera_file=a.json: cameras of a file are rendered by trajectory=cameras",
         ),
         (
             "trajectory=cameras",
-            "trajectory=cameras with camera_file=null: a file of cameras is rendered by trajectory=cameras cam",
+            "trajectory=cameras with camera_file=null: cameras of a file are rendered by trajectory=cameras",
         ),
         ("threads=0", "threads must be 1 to .* on this machine, or null for all cores, got 0"),
         ("threads=abc", "threads must be 1 to .* got abc"),
