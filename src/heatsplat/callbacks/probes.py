@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,6 +12,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from heatsplat.callbacks.asked_points import OPTION, AskedPoint, asked_points
 from heatsplat.callbacks.board import add_picture
 from heatsplat.contracts import Camera, Frame, SceneData, ViewSet, check_count, evenly_spread
 from heatsplat.io.pictures import figure_picture, literal, write_png
@@ -18,11 +20,14 @@ from heatsplat.io.quantities import clock_of, time_unit
 from heatsplat.io.tables import write_csv
 from heatsplat.shots import first_free_id
 
+log = logging.getLogger("heatsplat")
+
 PROBES_PICTURE = "renders/probes.png"
 CANDIDATES = 16  # validation cameras that are tried for a view of the probes
 OCCLUDERS = 3  # this many scene points close to a probe's pixel and well in front of it hide it
 NEAR_PIXELS = 0.02  # "close": of the image's width
 NEAR_DEPTH = 0.93  # "well in front": nearer than this times the probe's depth
+ASKED_CANDIDATES = 64  # training cameras that are tried for points that a table names
 DOTS = 200  # training images that are sampled where the true curve is not known
 
 
@@ -43,22 +48,40 @@ class TemperatureCurves(pl.Callback):
 
     The model's curve is the value of the rendered pixel on which the probe falls, seen from one validation camera at
     all times. The truth is the scene's own where it is synthetic; elsewhere dots show what the training images recorded
-    of the probe, each from its own camera. Probes are the scene's, or points of its cloud spread over the image. Models
-    that know no time, and scenes without times, have no curves. Moments beyond the training record, of test views, are
-    shaded and counted in the table's column "beyond_record_s"; where the clock of the record is known, the table has it.
+    of the probe, each from its own camera. Probes are those of a table, else the scene's, or points of its cloud spread over
+    the image. Models that know no time, and scenes without times, have no curves. Moments beyond the training record, of test
+    views, are shaded and counted in the table's column "beyond_record_s"; where the clock of the record is known, the table has
+    it.
 
     Args:
-        count: how many probes to draw at most.
+        count: how many probes to draw at most, of those that no table names.
         times: how many times the model is rendered at, between the first and the last frame.
+        points: CSV of the points whose curves are wanted (``asked_points``); None takes the scene's, or points of its cloud.
     """
 
-    def __init__(self, count: int = 6, times: int = 32) -> None:
+    def __init__(self, count: int = 6, times: int = 32, points: str | None = None) -> None:
         check_count("callbacks.probes.count", count, 0)
         check_count("callbacks.probes.times", times)
-        self.count, self.times = count, times
+        self.count, self.times, self.points = count, times, points
+        self._asked: list[AskedPoint] = []
         self._probes: list[Probe] | None = None
         self._dots: list[tuple[list[float], list[float]]] = []
         self._validations = 0
+
+    def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        self._ask(module)
+
+    def on_test_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        self._ask(module)
+        self._probes = None if self._asked else self._probes  # of pixels the surfaces are known better now
+
+    def _ask(self, module: pl.LightningModule) -> None:
+        """Reads the table of points before anything is trained or rendered in vain."""
+        if self.points is None or self._asked:
+            return
+        self._asked = asked_points(self.points, module.scene)
+        if not self._changes(module):
+            log.warning("%s=%s: a method or scene without time has no curves", OPTION, self.points)
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if trainer.sanity_checking:
@@ -72,11 +95,10 @@ class TemperatureCurves(pl.Callback):
 
     def _draw(self, module: pl.LightningModule, step: int, tag: str) -> None:
         scene = module.scene
-        known = scene.metadata
-        if "time" not in module.thermal.needs or "time" not in known or not self.count:
+        if not self._changes(module) or not (self.count or self._asked):
             return
         if self._probes is None:
-            self._probes = find_probes(scene, self.count)
+            self._probes = asked_probes(self._asked, module) if self._asked else find_probes(scene, self.count)
             self._dots = (
                 [recorded(probe, scene, module.modality) for probe in self._probes] if scene.truth is None else []
             )
@@ -102,6 +124,9 @@ class TemperatureCurves(pl.Callback):
         self._write(module, times.tolist(), model, truth)
         self._write_positions(module)
         add_picture(module, tag, picture, png, step)
+
+    def _changes(self, module: pl.LightningModule) -> bool:
+        return "time" in module.thermal.needs and "time" in module.scene.metadata
 
     def _rendered(self, module: pl.LightningModule, times: Tensor) -> np.ndarray:
         """Image values of the probes' pixels, [n, F] float64; one render per camera and time serves all its probes."""
@@ -173,7 +198,35 @@ def find_probes(scene: SceneData, count: int) -> list[Probe]:
         points, names = _spread_points(frames, cloud, count), None
     if not len(points) or not frames:
         return []
-    names = names or [f"probe {i + 1}" for i in range(len(points))]
+    return _looked_at(points, names or [f"probe {i + 1}" for i in range(len(points))], frames, cloud)
+
+
+def asked_probes(asked: Sequence[AskedPoint], module: pl.LightningModule) -> list[Probe]:
+    """The points of a table, each with a camera that sees it: that of its pixel, or of a training or validation view; those that
+    none sees are left out, and the log names them."""
+    scene, probes, places, names, unseen = module.scene, [], [], [], []
+    for one in asked:
+        place = one.placed(module.depth)
+        if place is None:
+            unseen.append(one.name)
+        elif one.frame is not None:
+            probes.append(Probe(one.name, place.float(), one.frame, one.row, one.column))
+        else:
+            places.append(place.float())
+            names.append(one.name)
+    if places:
+        views = [*scene.val.frames, *(scene.train.frames[i] for i in evenly_spread(len(scene.train), ASKED_CANDIDATES))]
+        cloud = scene.points[:: max(1, len(scene.points) // 20_000)]
+        probes += _looked_at(torch.stack(places), names, views, cloud)
+        unseen += sorted(set(names) - {probe.name for probe in probes})
+    if unseen:
+        log.warning("%s: no camera sees %s, of which there is no curve", OPTION, ", ".join(unseen))
+    order = [one.name for one in asked]
+    return sorted(probes, key=lambda probe: order.index(probe.name))
+
+
+def _looked_at(points: Tensor, names: Sequence[str], frames: Sequence[Frame], cloud: Tensor) -> list[Probe]:
+    """Points [n, 3] with a camera that sees each, chosen greedily; those that none sees are left out."""
     seen = torch.stack([seen_by(frame.camera, points, cloud) for frame in frames])
     chosen: dict[int, Frame] = {}
     left = torch.ones(len(points), dtype=torch.bool)
