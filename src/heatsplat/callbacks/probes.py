@@ -115,7 +115,7 @@ class TemperatureCurves(pl.Callback):
         model = to_unit(model)
         dots = [(t, [to_unit(v) for v in values]) for t, values in self._dots]
         names = [probe.name for probe in self._probes]
-        title = f"{scene.name}, step {step}"
+        title = f"{scene.name}, step {step}" if step else scene.name  # of a checkpoint no step is taken
         clock = clock_of(scene)
         title += "" if clock is None else f", 0 is {clock.at(0.0)}"
         record = min(scene.train.times_s), max(scene.train.times_s)
