@@ -40,6 +40,15 @@ def test_points_lie_on_surfaces_of_a_scene_that_cools_meanwhile(swept):
     assert len(points) > 300 and away.median() < 0.03 and away.quantile(0.8) < 0.06
 
 
+def test_a_view_of_which_little_counts_takes_no_point_away(cooling, swept):
+    """Of nine tenths of its pixels nothing is known; the noise of the scene is that of the other views."""
+    few = torch.zeros(52, 64, dtype=torch.bool)
+    few[:5] = True
+    train = cooling.train
+    masked = ViewSet(train.frames, lambda i: replace(train[i], mask=few) if i == 0 else train[i])
+    assert len(swept_points(replace(cooling, train=masked))) > 0.7 * len(swept)
+
+
 def test_pixels_that_no_block_of_the_smaller_images_holds_move_no_point(monkeypatch):
     """Images of 239 pixels become 23 of ten each; the rest is left out, and what is left lies where it did."""
     monkeypatch.setattr(module, "WIDEST", 25)

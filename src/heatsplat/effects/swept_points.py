@@ -56,7 +56,10 @@ def swept_points(scene: SceneData) -> Tensor:
     none = torch.zeros(0, 3, dtype=torch.float64)
     if len(images) < 3 or len(scene.points) == 0:
         return none
-    noise = noise_of(torch.stack(images), quantum_of(images[0])) if len({i.shape for i in images}) == 1 else 0.0
+    noise = 0.0
+    if len({image.shape for image in images}) == 1:
+        known = torch.stack(images).isfinite()
+        noise = noise_of(torch.stack(images).nan_to_num(), quantum_of(images[0][known[0]]), known)
     middle = scene.points.double().mean(0)
     found = [none]
     for k in evenly_spread(len(images), REFERENCES):
