@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from heatsplat.contracts import SceneError, counted, evenly_spread
+from heatsplat.contracts import SceneError, check_count, counted, evenly_spread
 from heatsplat.datamodules.formats import dji, flir
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import (
@@ -63,12 +63,20 @@ class Reading:
         zone: of times that have none, such as Europe/Berlin or +02:00; None leaves them as they are.
         table: file with a row for each frame, or None.
         columns: its columns: name, time, latitude_deg, longitude_deg, altitude_m, above_takeoff_m, yaw_deg, pitch_deg, roll_deg.
+        every: of each camera every so many-th frame is taken, the first one included.
+
+    Raises:
+        SceneError: ``every`` is no whole number from 1 on.
     """
 
     meaning: Meaning = field(default_factory=Meaning)
     zone: str | None = None
     table: Path | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        check_count("every", self.every)
 
 
 def reading_of(
@@ -79,10 +87,11 @@ def reading_of(
     zone: str | None = None,
     table: str | None = None,
     table_columns: Mapping[str, str] | None = None,
+    every: int = 1,
 ) -> Reading:
     """How a folder is read, from settings of a command: ``counts``, ``bounds_c`` and ``band_um`` are of ``Meaning``."""
     meaning = Meaning(**(counts or {}), bounds_c=bounds_c, band_um=band_um)
-    return Reading(meaning, zone, Path(table).expanduser() if table else None, table_columns or {})
+    return Reading(meaning, zone, Path(table).expanduser() if table else None, table_columns or {}, every)
 
 
 @dataclass(frozen=True)
@@ -154,6 +163,10 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
             f"{sum(f.time is None for f in frames)} of {len(frames)} frames have no time, so all are in the order of their "
             "names (table=... adds times)"
         )
+    if reading.every > 1:
+        taken = {frame.name for device in devices_of(frames) for frame in device.frames[:: reading.every]}
+        notes.append(f"every={reading.every} takes {len(taken)} of {counted(len(frames), 'frame')}")
+        frames = [frame for frame in frames if frame.name in taken]
     return Recording(frames, notes)
 
 

@@ -42,6 +42,7 @@ def prepare(
     zone: str | None = None,
     table: str | None = None,
     table_columns: Mapping[str, str] | None = None,
+    every: int = 1,
     keep_counts: bool = False,
     doctor: Doctor | None = None,
     poses: Poses | None = None,
@@ -59,7 +60,7 @@ def prepare(
         uncertainty: arguments of ``InputUncertainty``.
         counts: ``scale``, ``offset_c`` and ``planck`` of ``Meaning``.
         bounds_c, band_um: of ``Meaning``.
-        zone, table, table_columns: of ``Reading``.
+        zone, table, table_columns, every: of ``Reading``.
         keep_counts: also write the numbers as the camera stored them.
         doctor: looks at the folder first, and at the scene once it has cameras, or None.
         poses: finds the cameras, or None.
@@ -76,7 +77,13 @@ def prepare(
         raise SceneError(f"target={target} lies in source={folder}; give a folder outside of it")
     given, uncertain = GivenConditions(**conditions), InputUncertainty(**uncertainty)
     reading = reading_of(
-        counts=counts, bounds_c=bounds_c, band_um=band_um, zone=zone, table=table, table_columns=table_columns
+        counts=counts,
+        bounds_c=bounds_c,
+        band_um=band_um,
+        zone=zone,
+        table=table,
+        table_columns=table_columns,
+        every=every,
     )
     found = read_recording(folder, reading)
     for note in found.notes:

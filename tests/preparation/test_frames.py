@@ -37,6 +37,18 @@ def test_frames_without_times_are_in_the_order_of_the_numbers_in_their_names(tmp
     assert any("4 of 4 frames have no time" in note for note in found.notes)
 
 
+def test_every_so_many_th_frame_of_each_camera_is_taken(tmp_path):
+    small = FLOATS[:16, :20]
+    names = {f"a{i}.tiff": FLOATS for i in range(7)} | {f"b{i}.tiff": small for i in range(3)}
+    folder = write_images(tmp_path, names)
+    found = read_recording(folder, Reading(every=3))
+    assert [frame.name for frame in found.frames] == ["a0", "a3", "a6", "b0"]
+    assert "every=3 takes 4 of 10 frames" in found.notes
+    for wrong in (0, 1.5, True):
+        with pytest.raises(SceneError, match=f"every must be a whole number, 1 or more, got {wrong}"):
+            Reading(every=wrong)
+
+
 def test_hidden_files_are_no_frames(tmp_path):
     """macOS puts one beside each file that it copies to a card, and other programs keep thumbnails."""
     write_images(tmp_path, {"a1.tiff": FLOATS, "a2.tiff": FLOATS})
