@@ -323,6 +323,26 @@ def test_what_a_pass_of_the_views_hardly_shows_leaves_after_it():
     assert cloud.splats.means[:, 0].tolist() == [0, 3, 15] and not cloud.state["shown"].any()
 
 
+def test_what_only_masked_pixels_show_leaves_and_does_not_count_as_right():
+    policy = budget(start=0, stop=100, every=4, noise=0.01, remove_at=(4,))
+    policy.prepare(noisy_scene(0.01, 4), "thermal")
+    quats, K = torch.tensor([[1.0, 0, 0, 0]] * 2), torch.tensor([[20.0, 0, 10], [0, 20, 5], [0, 0, 1]])
+    means = torch.tensor([[-0.25, 0.0, 1.0], [0.25, 0.0, 1.0]])
+    known = torch.full((10, 20, 1), 0.5)
+    known[:, 10:] = torch.nan
+    cloud = make_cloud(policy, 2)
+    for step in range(4, 8):
+        output = rasterization(
+            means, quats, torch.full((2, 3), 0.02), torch.full((1, 2), 0.6), torch.zeros(2, 1), torch.eye(4), K, 20, 10,
+            backend="cpu", depth=False, maps=policy.maps_at(step),
+        )  # fmt: skip
+        (output.weighted.image * policy.pixel_maps(torch.zeros(10, 20), known, step)).sum().backward()
+        policy.observe(cloud.state, output, CAMERA, step)
+    assert cloud.state["weight"][0] > 1 and cloud.state["weight"][1] == 0
+    assert cloud.state["seen"].tolist() == [4, 0]
+    assert policy._worth(cloud).tolist() == [True, False]
+
+
 def test_what_another_modality_shows_stays():
     policy = budget(start=0, stop=10, every=10, remove_at=(0,))
     cloud = make_cloud(policy, 3)

@@ -69,7 +69,7 @@ class DensityControl:
         Args:
             error: [H, W] absolute error of each pixel in image units, mean over channels, 0 where a pixel does not count; on
                 the grid on which training renders.
-            target: [H, W, C] the training image on that grid, in image units.
+            target: [H, W, C] the training image on that grid, in image units; NaN where a pixel does not count.
             step: training step.
         """
         return error.new_zeros(*error.shape, 0)

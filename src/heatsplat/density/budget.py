@@ -48,8 +48,8 @@ class Budget(DensityControl):
     begins at a step of ``remove_at`` or later, those outside the share ``keep`` of all blending weights, and those seen in
     fewer than two of several views. Nothing is added after ``stop``, and opacities are never reset.
 
-    With several modalities, errors are those of all images and blending weights those of the first; what another modality
-    shows is never removed.
+    Blending weights are those on pixels that count: what only masked pixels show is shown by no view. With several modalities,
+    errors are those of all images and blending weights those of the first; what another modality shows is never removed.
 
     After Taming 3DGS (Mallick et al. 2024: budget, concave curve), Revising Densification (Bulo et al. 2024: error by
     blending weights), AbsGS (Ye et al. 2024: pull), Improved-GS (2025: long-axis split, root curve) and Mini-Splatting2
@@ -150,7 +150,7 @@ class Budget(DensityControl):
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """What was summed since the last event, each [count]: for growth, as far as the score asks, "pull", "weight" and "wrong"
-        (pixels) and "worth" (errors or edges); "shown" (pixels) and "seen" (views) for removal."""
+        (pixels) and "worth" (errors or edges); "shown" (pixels) and "seen" (views) for removal. Pixels are those that count."""
         return {name: torch.zeros(count, device=device) for name in (*self._summed, "shown", "seen")}
 
     @property
@@ -203,7 +203,9 @@ class Budget(DensityControl):
     def pixel_maps(self, error: Tensor, target: Tensor, step: int) -> Tensor:
         beyond = (error - self.floor * (self.noise or 0.0)).clamp(min=0)
         worth = _edges(target).to(error) if self.score == "edge" and self._scores(step) else beyond
-        maps = torch.stack([torch.ones_like(error), (beyond > 0).to(error), worth], dim=-1)
+        # What shows only where no pixel counts was never compared with anything.
+        known = target.isnan().any(dim=-1).logical_not().to(error)
+        maps = torch.stack([known, (beyond > 0).to(error), worth], dim=-1)
         return maps[..., : self.maps_at(step)]
 
     @torch.no_grad()
