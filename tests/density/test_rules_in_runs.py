@@ -8,6 +8,7 @@ from helpers import OF_GAUSSIANS
 from running import BARE, QUIET, run
 
 from heatsplat.thermal.static import Static
+from heatsplat.training.adam import OnePassAdam
 from heatsplat.training.checkpoints import load_checkpoint
 from heatsplat.training.module import CHECKPOINT_KEY, SplatTraining
 
@@ -87,6 +88,35 @@ def test_a_run_that_sums_gradients_of_views_moves_at_every_second_step_and_resum
     half = tmp_path / "whole" / "checkpoints" / "step_000009.ckpt"  # one view waits
     resumed = state_of(*run(tmp_path / "resumed", *given, f"ckpt={half}"))
     assert [name for name in whole if not torch.equal(whole[name], resumed[name])] == []
+
+
+@pytest.mark.parametrize(
+    ("ends", "cleared"),
+    [({5: 75, 8: 8}, [0, 1, 2, 3, 4, 5, 6]), ({7: 9}, [0, 1, 2, 3, 4, 5, 6, 8])],
+    ids=["later", "sooner"],
+)
+def test_gradients_count_once_where_the_end_of_a_run_is_moved(ends, cleared, tmp_path, monkeypatch):
+    """As a budget of time moves it: what the moved plan says of the last step is not what was done in it."""
+    found, done, clear, batch_end = [], [0], OnePassAdam.zero_grad, SplatTraining.on_train_batch_end
+
+    def moved(self, *rest):
+        done[0] = self.global_step
+        if self.global_step in ends:
+            self.schedule.end_at(self.global_step, ends[self.global_step])
+        batch_end(self, *rest)
+
+    monkeypatch.setattr(SplatTraining, "on_train_batch_end", moved)
+    monkeypatch.setattr(OnePassAdam, "zero_grad", lambda self, *rest: (found.append(done[0]), clear(self, *rest)))
+    run(
+        tmp_path,
+        *BARE,
+        "method=3dgs",
+        "density=fixed",
+        "optim.accumulate=2",
+        "optim.accumulate_from=0.4",
+        "max_steps=12",
+    )
+    assert found == cleared
 
 
 def test_a_whole_pass_of_the_views_is_judged_in_every_round(tmp_path, monkeypatch):

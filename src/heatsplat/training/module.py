@@ -123,6 +123,9 @@ class SplatTraining(SceneModel):
         self._rendered: tuple[RenderOutput, Camera] | None = None
         self._pixels = 0  # of the last target
         self._checked_trained = False  # after the first step, which may make parameters
+        self._updated = (
+            True  # in the last step; else its gradients wait, whatever a plan that was moved since says of it
+        )
         self._average = Average()
         self._averaged = thermal.averaged if optim.averaged is None else optim.averaged
         self._waiting: dict[str, Any] = {}  # gradients of a checkpoint that was written between two updates
@@ -338,8 +341,7 @@ class SplatTraining(SceneModel):
         return last or self.optim.updates(step, self.schedule.round_progress(step))
 
     def optimizer_zero_grad(self, epoch, batch_idx, optimizer) -> None:
-        step = self.global_step
-        if step == 0 or self._updates(step - 1):
+        if self._updated:
             # What Lightning clips has to be in grad.
             plain(optimizer).takes_unwritten = not self.trainer.gradient_clip_val
             optimizer.zero_grad()
@@ -355,6 +357,7 @@ class SplatTraining(SceneModel):
         update = self._updates(step)
         with self.stages.on_step(step, inner):
             optimizer.step(closure=optimizer_closure) if update else optimizer_closure()
+        self._updated = update
         if not self._checked_trained:
             self._checked_trained = True
             check_trained(self, inner)
@@ -444,7 +447,7 @@ class SplatTraining(SceneModel):
             "density_times": self.density.times(),
             "density_state": {name: tensor.detach().cpu() for name, tensor in self._density_state.items()},
         }
-        if self.global_step > 0 and not self._updates(self.global_step - 1):
+        if not self._updated:
             checkpoint[CHECKPOINT_KEY] |= waiting_gradients(self)
         if self._average:
             checkpoint[CHECKPOINT_KEY]["average"] = self._average.state_dict()
@@ -477,6 +480,7 @@ class SplatTraining(SceneModel):
             if "average" in own:  # of a run that goes on for longer, these updates are not the last ones
                 self._average.load_state_dict(own["average"], self.device)
         self._waiting = {name: own[name] for name in ("gradients", "unwritten") if name in own}
+        self._updated = not self._waiting
         state = own["density_state"]
         self._density_state = {name: tensor.to(self.device) for name, tensor in state.items()}
 
