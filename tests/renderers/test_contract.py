@@ -836,6 +836,9 @@ OF_OTHER_TYPES = [
     ({"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None]}, r"one camera per call, such as viewmats\[0\], Ks\[0\]"),
     ({"viewmats": torch.full((4, 4), torch.nan)}, "viewmats has NaN or infinite values"),
     ({"Ks": torch.zeros(3, 3)}, r"Ks needs fx and fy above 0 pixels \(its \[0, 0\] and \[1, 1\]\), got 0 and 0"),
+    ({"Ks": torch.tensor([[20.0, 0, torch.nan], [0, 20, 10], [0, 0, 1]])}, r"of finite numbers, got \[\[20.0, 0.0, nan\]"),
+    ({"Ks": torch.tensor([[torch.inf, 0, 12.0], [0, 20, 10], [0, 0, 1]])}, "of finite numbers, got"),
+    ({"Ks": camera_matrix(20.0, 24, 20).T}, r"Ks must be \[\[fx, 0, cx\], \[0, fy, cy\], \[0, 0, 1\]\] of finite numbers"),
     ({"near": -1.0}, "near must be 0 or more, and far beyond it, got near -1.0"),
     ({"width": 24.0}, "width and height must be whole numbers of pixels, got 24.0 and 20"),
 ]  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -103,8 +104,8 @@ def rasterization(
 
     Raises:
         ValueError: shapes, types or devices do not fit together, eps2d is not positive, near is negative or far not beyond it,
-            a camera on the CPU is not finite or has no focal length, the intrinsics have skew or want a gradient of "gsplat", or
-            the backend is unknown.
+            a camera on the CPU is not finite, has no focal length or intrinsics of another form, these want a gradient of
+            "gsplat", or the backend is unknown.
         ImportError: the backend is gsplat and it is not installed (the message says how to get it).
     """
     _check_gaussians(means, quats, scales, opacities, features, background, signs)
@@ -187,11 +188,13 @@ def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, near: f
         )
     # On a GPU a look at them would wait for the device.
     if Ks.device.type == "cpu":
-        (fx, skew, _), (_, fy, _), _ = Ks.detach().tolist()
+        (fx, skew, cx), (below, fy, cy), last = Ks.detach().tolist()
         if skew:
             raise ValueError(f"Ks has a skew of {skew:.6g} (its [0, 1]), which no renderer has: undistort images to 0")
         if not (fx > 0 and fy > 0):
             raise ValueError(f"Ks needs fx and fy above 0 pixels (its [0, 0] and [1, 1]), got {fx:.6g} and {fy:.6g}")
+        if below or last != [0.0, 0.0, 1.0] or not all(map(math.isfinite, (fx, fy, cx, cy))):
+            raise ValueError(f"Ks must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of finite numbers, got {Ks.tolist()}")
     if viewmats.device.type == "cpu" and not bool(viewmats.detach().isfinite().all()):
         raise ValueError("viewmats has NaN or infinite values")
     if not eps2d > 0:
