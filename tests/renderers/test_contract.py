@@ -650,6 +650,30 @@ def test_all_gradients_of_axis_ratios_of_50_000(backend, scales):
     assert_close(run(backend, scene), oracle(scene), *((2e-3, 4e-2) if few_digits else (1e-4, 1e-2)))
 
 
+@pytest.mark.parametrize("backend", ["reference", "cpu"])  # gsplat's float32 covariances leave few digits of such
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("length", [50.0, 1e3, 1e5])
+def test_all_gradients_of_needles_that_reach_far_beyond_the_image(backend, length, antialiased):
+    """What they have in the image says next to nothing of their length, and rounding must not say more."""
+    generator = generator_for(3, 0, "needles")
+    quats = torch.randn(30, 4, generator=generator, dtype=torch.float64)
+    means = torch.rand(30, 3, generator=generator, dtype=torch.float64) * 2 - torch.tensor([1.0, 1.0, -2.0])
+    scene = facing(means.tolist(), (length, 0.05, 0.03), 0.7, quats)
+    actual = run(backend, scene, antialiased=antialiased)
+    assert_close(actual, oracle(scene, antialiased=antialiased), 1e-5, 1e-4)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("scale", [1e12, 1e30, math.inf])
+def test_gaussians_whose_determinant_no_float_holds_are_not_seen_on_a_processor(scale, antialiased):
+    means = [[0, 0, 2.0], [0.3, 0.2, 3.0], [-0.3, 0.1, 2.5], [0.1, -0.1, 0.02]]
+    scales = torch.tensor([[0.2, 0.1, 0.3]] * 4).double()
+    scales[[0, 3]] = scale
+    actual = run("cpu", facing(means, scales, 0.4), antialiased=antialiased)
+    assert_finite(actual)
+    assert_unseen(actual, [0, 3])
+
+
 def test_discs_seen_from_the_edge(backend):
     # Discs in planes through the camera: the projection is a line, its determinant is 0 without the blur.
     for antialiased in (False, True):

@@ -32,6 +32,8 @@ def render(inputs: RenderInputs) -> RenderOutput:
 
     The image and all gradients are bitwise the same for any number of threads and from run to run.
 
+    **Convention:** Gaussians whose screen covariance has a determinant beyond float32 are not seen (round ones of 4e9 pixels).
+
     Raises:
         ValueError: tensors are not float32 on the CPU, or features do not fit.
     """
