@@ -69,7 +69,13 @@ def test_values_are_seen_before_black_whatever_lies_behind_images():
     [
         ({"backend": "opengl"}, "renderer.backend must be one of auto, .*, got 'opengl'"),
         ({"background": "black"}, "renderer.background must be 'ambient' or a number"),
+        ({"background": 1.2}, r"renderer.background must be 'ambient' or a number in \[0, 1\], got '1.2'"),
+        ({"background": float("nan")}, "renderer.background must be 'ambient' or a number"),
+        ({"background": True}, "renderer.background must be 'ambient' or a number"),
         ({"eps2d": 0.0}, "renderer.eps2d must be above 0"),
+        ({"eps2d": float("inf")}, "renderer.eps2d must be above 0 .* and finite"),
+        ({"near": -1.0}, "renderer.near must be 0 or more"),
+        ({"near": 2.0, "far": 1.0}, "renderer.far beyond it, got 2.0 and 1.0"),
     ],
 )
 def test_wrong_settings_are_refused(options, message):

@@ -189,6 +189,11 @@ def test_a_setting_that_is_changed_where_nothing_reads_it_is_refused(change, tol
         checked(config)
 
 
+def test_a_setting_that_is_not_a_number_was_not_changed():
+    config = heatsplat.compose(["method=3dgs", "renderer.background=nan"])
+    assert checked(config) is config  # the renderer refuses it
+
+
 @pytest.mark.parametrize(("method", "key", "value"), [("etgs", "cap_max", 9), ("thermogs", "first_steps", 7)])
 def test_a_setting_that_others_were_made_of_is_refused_once_it_is_changed(tmp_path, method, key, value):
     config = heatsplat.compose([*TINY, "max_steps=20", f"method={method}"])

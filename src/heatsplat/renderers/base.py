@@ -103,9 +103,9 @@ def rasterization(
         RenderOutput with features [H, W, C], alpha [M, H, W], depth [H, W] or None, and meta.
 
     Raises:
-        ValueError: shapes, types or devices do not fit together, eps2d is not positive, near is negative or far not beyond it,
-            a camera on the CPU is not finite, has no focal length or intrinsics of another form, these want a gradient of
-            "gsplat", or the backend is unknown.
+        ValueError: shapes, types or devices do not fit together, eps2d is not positive and finite, near is negative or far not
+            beyond it, a camera on the CPU is not finite, has no focal length or intrinsics of another form, these want a gradient
+            of "gsplat", or the backend is unknown.
         ImportError: the backend is gsplat and it is not installed (the message says how to get it).
     """
     _check_gaussians(means, quats, scales, opacities, features, background, signs)
@@ -197,8 +197,8 @@ def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, near: f
             raise ValueError(f"Ks must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of finite numbers, got {Ks.tolist()}")
     if viewmats.device.type == "cpu" and not bool(viewmats.detach().isfinite().all()):
         raise ValueError("viewmats has NaN or infinite values")
-    if not eps2d > 0:
-        raise ValueError(f"eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1), got {eps2d}")
+    if not 0 < eps2d < math.inf:
+        raise ValueError(f"eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1) and finite, got {eps2d}")
     if not 0 <= near < far:
         raise ValueError(f"near must be 0 or more, and far beyond it, got near {near} and far {far}")
     if not (isinstance(width, Integral) and isinstance(height, Integral)):

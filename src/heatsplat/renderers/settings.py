@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from copy import copy
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, RenderOutput, SceneData, check_option
+from heatsplat.contracts import Camera, RenderOutput, SceneData, check_option, is_number
 from heatsplat.renderers.base import BACKENDS, EPS2D, rasterization
 from heatsplat.splats import ANCHORS, GAUSSIANS
 
@@ -31,6 +32,9 @@ class Renderer:
 
     Attributes:
         rows: what rows of the splats may be that it makes images of (``heatsplat.splats``).
+
+    Raises:
+        ValueError: an option is out of its range.
     """
 
     rows = frozenset({GAUSSIANS, ANCHORS})
@@ -45,10 +49,14 @@ class Renderer:
         eps2d: float = EPS2D,
     ) -> None:
         check_option("renderer.backend", backend, ("auto", *BACKENDS))
-        if isinstance(background, str) and background != "ambient":
+        if background != "ambient" and not (is_number(background) and 0 <= background <= 1):
             raise ValueError(f"renderer.background must be 'ambient' or a number in [0, 1], got '{background}'")
-        if not eps2d > 0:
-            raise ValueError(f"renderer.eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1), got {eps2d}")
+        if not 0 < eps2d < math.inf:
+            raise ValueError(
+                f"renderer.eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1) and finite, got {eps2d}"
+            )
+        if not 0 <= near < far:
+            raise ValueError(f"renderer.near must be 0 or more, and renderer.far beyond it, got {near} and {far}")
         self.eps2d = eps2d
         self.backend, self.antialiased, self.near, self.far = backend, antialiased, near, far
         self.background = background

@@ -98,7 +98,8 @@ def _difference(key: str, one: Any, other: Any) -> tuple[str, Any, Any] | None:
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         found = (_difference(f"{key}.{name}", one.get(name), other.get(name)) for name in {**other, **one})
         return next((difference for difference in found if difference is not None), None)
-    return None if one == other else (key, one, other)
+    same = one == other or (one != one and other != other)  # NaN, which the check of its kind refuses
+    return None if same else (key, one, other)
 
 
 def _check_first_stage(config: Mapping[str, Any]) -> None:
