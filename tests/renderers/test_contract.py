@@ -859,6 +859,7 @@ OF_OTHER_TYPES = [
     ({"Ks": np.eye(3)}, "Ks must be a tensor, got numpy.ndarray"),
     ({"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None]}, r"one camera per call, such as viewmats\[0\], Ks\[0\]"),
     ({"viewmats": torch.full((4, 4), torch.nan)}, "viewmats has NaN or infinite values"),
+    ({"viewmats": look_at(torch.tensor([1.0, 2, 3]), torch.zeros(3), torch.tensor([0.0, 0, 1])).T}, "is it transposed, as"),
     ({"Ks": torch.zeros(3, 3)}, r"Ks needs fx and fy above 0 pixels \(its \[0, 0\] and \[1, 1\]\), got 0 and 0"),
     ({"Ks": torch.tensor([[20.0, 0, torch.nan], [0, 20, 10], [0, 0, 1]])}, r"of finite numbers, got \[\[20.0, 0.0, nan\]"),
     ({"Ks": torch.tensor([[torch.inf, 0, 12.0], [0, 20, 10], [0, 0, 1]])}, "of finite numbers, got"),

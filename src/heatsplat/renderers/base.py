@@ -20,6 +20,8 @@ ALPHA_MAX = 0.999  # alpha is clamped here; its gradient is zero where it is
 TRANSMITTANCE_MIN = 1e-4  # a pixel is finished before its transmittance would fall to this
 FOV_MARGIN = 0.3  # the Jacobian's x/z and y/z are clamped at the image border plus this times half the field of view
 
+LAST_ROW = 1e-3  # of a view matrix, off 0, 0, 0, 1: more than rounding makes of it in float32
+
 BACKENDS = ("reference", "cpu", "gsplat")
 
 
@@ -104,7 +106,7 @@ def rasterization(
 
     Raises:
         ValueError: shapes, types or devices do not fit together, eps2d is not positive and finite, near is negative or far not
-            beyond it, a camera on the CPU is not finite, has no focal length or intrinsics of another form, these want a gradient
+            beyond it, a camera on the CPU is not finite, has no focal length or matrices of another form, Ks wants a gradient
             of "gsplat", or the backend is unknown.
         ImportError: the backend is gsplat and it is not installed (the message says how to get it).
     """
@@ -195,8 +197,15 @@ def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, near: f
             raise ValueError(f"Ks needs fx and fy above 0 pixels (its [0, 0] and [1, 1]), got {fx:.6g} and {fy:.6g}")
         if below or last != [0.0, 0.0, 1.0] or not all(map(math.isfinite, (fx, fy, cx, cy))):
             raise ValueError(f"Ks must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of finite numbers, got {Ks.tolist()}")
-    if viewmats.device.type == "cpu" and not bool(viewmats.detach().isfinite().all()):
-        raise ValueError("viewmats has NaN or infinite values")
+    if viewmats.device.type == "cpu":
+        if not bool(viewmats.detach().isfinite().all()):
+            raise ValueError("viewmats has NaN or infinite values")
+        last = viewmats[3].tolist()
+        if max(abs(number - wanted) for number, wanted in zip(last, (0.0, 0.0, 0.0, 1.0), strict=True)) > LAST_ROW:
+            raise ValueError(
+                f"viewmats must map world to camera, with 0, 0, 0, 1 in its last row, got {last}: is it transposed, as 3DGS "
+                "has its world_view_transform?"
+            )
     if not 0 < eps2d < math.inf:
         raise ValueError(f"eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1) and finite, got {eps2d}")
     if not 0 <= near < far:
