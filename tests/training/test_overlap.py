@@ -5,8 +5,9 @@ import torch
 
 from heatsplat.density.ops import Cloud
 from heatsplat.renderers.base import rasterization
-from heatsplat.splats import Splats
+from heatsplat.splats import GEOMETRY, Splats
 from heatsplat.training.overlap import Overlap, ShortLists
+from heatsplat.training.schedule import Schedule
 
 COUNT, SIDE = 12, 16
 ALWAYS = {"entropy_start": 0, "entropy_stop": 10**6, "entropy_every": 1}
@@ -106,6 +107,29 @@ def test_a_reset_shrinks_all_and_forgets_all_moments():
     assert sizes[-1] == pytest.approx(0.008)
     settled = [rule.settled(step) for step in range(60)]
     assert [step for step in range(60) if not settled[step]] == [*range(19, 24), *range(29, 34), *range(39, 44)]
+
+
+@pytest.mark.parametrize(
+    ("moved", "resets"), [({}, [20, 30, 40]), ({12: 36}, [16, 21, 26]), ({12: 36, 20: 65, 30: 45}, [16, 23, 33])]
+)
+def test_resets_and_entropy_follow_an_end_that_moves(moved, resets):
+    schedule = Schedule(60)
+    rule = ShortLists(reset_every=10, reset_start=20, reset_stop=45, entropy_start=30, entropy_stop=50, entropy_every=1)
+    rule.planned = schedule.planned
+    splats = Splats({name: torch.zeros(2, 3) for name in GEOMETRY})
+    found, asked, step = [], [], 0
+    while step < schedule.end:
+        if rule.signs_at(step, 2, seed=0) is not None:
+            asked.append(schedule.progress(step))
+        splats["log_scales"].grad = torch.zeros(2, 3)
+        if rule.shrink(Cloud(splats, None, {}), step):
+            found.append(step + 1)
+            assert not rule.settled(step)
+        step += 1
+        if step in moved:
+            schedule.end_at(step, moved[step])
+    assert found == resets and rule.settled(step - 1)
+    assert min(asked) == pytest.approx(0.5, abs=0.05) and max(asked) == pytest.approx(49 / 60, abs=0.05)
 
 
 def test_sizes_that_a_stage_holds_still_are_not_reset():

@@ -47,12 +47,12 @@ class DecoupledDecay:
         self.opacity_start, self.size_start, self.stop = opacity_start, size_start, stop
 
     @torch.no_grad()
-    def __call__(self, optimizer: torch.optim.Optimizer, step: int, pixels: int, extent: float) -> None:
+    def __call__(self, optimizer: torch.optim.Optimizer, step: float, pixels: int, extent: float) -> None:
         """Lets the parameters of the groups "opacity_logits" and "log_scales" decay, in place.
 
         Args:
             optimizer: an Adam that has just stepped.
-            step: training step.
+            step: training step, that of the plan where the end of the run was moved (``Schedule.planned``).
             pixels: number of pixels of the image.
             extent: length unit of the scene.
         """

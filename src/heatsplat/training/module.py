@@ -111,6 +111,7 @@ class SplatTraining(SceneModel):
         self.merging = merging or Merging()
         self.resolution = resolution or Resolution()
         self.overlap = overlap or Overlap()
+        self.overlap.planned = self.schedule.planned
         self.surroundings = surroundings or Surroundings()
         self.output_dir = Path(output_dir)
         self.supersample = supersample
@@ -364,7 +365,7 @@ class SplatTraining(SceneModel):
         cloud = self.cloud(inner)
         here = self.schedule.round_step(step)
         if self.optim.decoupled is not None and update:
-            self.optim.decoupled(inner, here, self._pixels, self.scene.extent)
+            self.optim.decoupled(inner, self.schedule.planned(here), self._pixels, self.scene.extent)
         shrunk = self.overlap.shrink(cloud, here)
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
             cloud.drop(name, gone, instead)

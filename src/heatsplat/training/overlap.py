@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -20,9 +21,11 @@ class Overlap:
 
     Attributes:
         rows: of which models (``ThermalModel.rows``) it knows the rows of the splats.
+        planned: function of a step to that of the plan for which it stands (``Schedule.planned``), as the run tells it.
     """
 
     rows = frozenset({GAUSSIANS, ANCHORS, NOTHING})
+    planned: Callable[[float], float] = staticmethod(lambda step: step)
 
     def signs_at(self, step: int, count: int, seed: int) -> Tensor | None:
         """Random signs [N] to be composited in this step (``rasterization``); None where ``entropy`` is not wanted."""
@@ -51,6 +54,8 @@ class ShortLists(Overlap):
     smallest where one Gaussian has all. The paper takes Shannon's, whose gradient needs the weight of each Gaussian in each
     pixel, from kernels made for it. Order 2 needs none: with random signs s, (Σ w s)² is Σ w² in the mean over signs, and
     Σ w s is an image of one more channel.
+
+    Steps are those of the plan: where the end of a run is moved, resets and entropy are moved with it.
 
     Args:
         entropy: weight of the mean entropy of a pixel. 0: none.
@@ -90,7 +95,7 @@ class ShortLists(Overlap):
         self.reset_start, self.reset_stop = reset_start, reset_stop
 
     def signs_at(self, step: int, count: int, seed: int) -> Tensor | None:
-        wanted = self.entropy_start <= step < self.entropy_stop and step % self.entropy_every == 0
+        wanted = self.entropy_start <= self.planned(step) < self.entropy_stop and step % self.entropy_every == 0
         if self.weight == 0 or not wanted:
             return None
         return 2.0 * torch.randint(2, (count,), generator=generator_for(seed, step, "signs")) - 1.0
@@ -99,17 +104,14 @@ class ShortLists(Overlap):
         alone = output.signed.square() + (1.0 - output.alpha[0]).square()
         return self.weight * (1.0 - alone.mean())
 
-    def _resets(self, step: int) -> bool:
-        """Whether sizes are reset after ``step``."""
-        return (
-            self.reset_factor < 1
-            and self.reset_start <= step + 1 < self.reset_stop
-            and (step + 1) % self.reset_every == 0
-        )
+    def _last_reset(self, step: int) -> float:
+        """The steps of the plan after which sizes were reset last, up to ``step``; 0 before the first."""
+        last = min(self.planned(step + 1), self.reset_stop - 1) // self.reset_every * self.reset_every
+        return last if self.reset_factor < 1 and last >= self.reset_start else 0
 
     @torch.no_grad()
     def shrink(self, cloud: Cloud, step: int) -> bool:
-        if not self._resets(step) or cloud.is_held("log_scales"):
+        if not 0 < self._last_reset(step) > self.planned(step) or cloud.is_held("log_scales"):
             return False
         cloud.overwrite("log_scales", cloud.splats["log_scales"] + math.log(self.reset_factor))
         if cloud.optimizer is not None:
@@ -117,5 +119,5 @@ class ShortLists(Overlap):
         return True
 
     def settled(self, step: int) -> bool:
-        recent = range(max(step - int(RECOVERY * self.reset_every) + 1, 0), step + 1)
-        return not any(self._resets(earlier) for earlier in recent)
+        last = self._last_reset(step)
+        return last <= 0 or self.planned(step + 1) - last >= int(RECOVERY * self.reset_every)

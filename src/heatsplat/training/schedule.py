@@ -47,6 +47,14 @@ class Schedule:
         passed = (self.steps - self._planned) * (step - self._start) / (self._end - self._start)
         return min(self._planned + passed, self.steps)
 
+    def planned(self, round_step: float) -> float:
+        """The step of the plan that a step stands for, both counted from the first of the last round; itself as long as the end
+        is where it was planned."""
+        if (self._start, self._end) == (self._planned, self.steps):
+            return round_step
+        first = max(self.restarts, default=0)
+        return self._planned_step(first + round_step) - first
+
     def progress(self, step: float) -> float:
         """Share of the run that is done after ``step`` steps, in [0, 1]."""
         return self._planned_step(step) / self.steps
