@@ -91,7 +91,8 @@ class Synthetic(SceneDataModule):
         self.drawn = None if number is None else drawn(number)
         outdoors = scene in YARDS or self.drawn is not None and isinstance(self.drawn.preset, OutdoorPreset)
         in_parts = split == "parts"
-        own_split = YARDS[scene][1].split if scene in YARDS else "json" if in_parts else "every_8th"
+        # The subsets of the frames ("json") are the parts, too.
+        own_split = "json" if in_parts else YARDS[scene][1].split if scene in YARDS else "every_8th"
         super().__init__(root=root, scene=scene, split=own_split if in_parts else split or own_split, **options)
         if scene not in PRESETS and not outdoors and self.drawn is None and number_of(scene, ROOM) is None:
             known = ", ".join((*PRESETS, *YARDS, *(f"{name}0, {name}1 and so on" for name in (ROOM, DRAWN))))
