@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -36,7 +37,7 @@ def video(path: str | Path, fps: float = 24.0, codec: str = "auto") -> Iterator[
     Raises:
         ImportError: codec "h264" without the extra.
         ValueError: no pictures, one of another size or type, or an unknown codec.
-        OSError: the file cannot be written.
+        OSError: the file cannot be written, or not as a whole.
     """
     path = Path(path)
     if path.suffix.lower() != ".mp4":
@@ -68,6 +69,8 @@ def video(path: str | Path, fps: float = 24.0, codec: str = "auto") -> Iterator[
             close()
     if count == 0:
         raise ValueError(f"{path}: a video needs at least one frame")
+    if not _complete(path):  # of which neither encoder says a word
+        raise OSError(f"cannot write all of {path}: is the disk full?")
 
 
 def encoder(codec: str) -> Callable[[Path, tuple[int, int], float], tuple[Callable, Callable]]:
@@ -95,6 +98,19 @@ def encoder(codec: str) -> Callable[[Path, tuple[int, int], float], tuple[Callab
         return lambda picture: writer.send(np.ascontiguousarray(picture)), writer.close
 
     return ffmpeg
+
+
+def _complete(path: Path) -> bool:
+    """Whether a file is a whole MPEG-4: boxes up to its end, with the index ("moov") among them."""
+    size, place, kinds = path.stat().st_size, 0, set()
+    with path.open("rb") as file:
+        while place < size:
+            file.seek(place)
+            length, kind = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
+            length = int.from_bytes(file.read(8), "big") if length == 1 else length or size - place
+            kinds.add(kind)
+            place += max(length, 8)
+    return place == size and b"moov" in kinds
 
 
 def _opencv(path: Path, size: tuple[int, int], fps: float) -> tuple[Callable, Callable]:
