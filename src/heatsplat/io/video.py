@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import struct
 from collections.abc import Callable, Iterator
@@ -70,7 +71,7 @@ def video(path: str | Path, fps: float = 24.0, codec: str = "auto") -> Iterator[
     if count == 0:
         raise ValueError(f"{path}: a video needs at least one frame")
     if not _complete(path):  # of which neither encoder says a word
-        raise OSError(f"cannot write all of {path}: is the disk full?")
+        raise OSError(errno.ENOSPC, "not all of the video was written", str(path))
 
 
 def encoder(codec: str) -> Callable[[Path, tuple[int, int], float], tuple[Callable, Callable]]:
