@@ -13,19 +13,11 @@ PLAIN = re.compile(r"[\w./-]+", re.ASCII)
 NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d[\d_]*)?|[+-]?(inf|nan)", re.ASCII | re.IGNORECASE)
 NO_TEXT = re.compile(r"null|true|false", re.IGNORECASE)
 # Settings that name a file, a folder or a scene, whatever it is called.
-NAMES = frozenset(
-    {
-        "ckpt",
-        "data.root",
-        "data.scene",
-        "data.split_file",
-        "hydra.run.dir",
-        "hydra.sweep.dir",
-        "init.path",
-        "source",
-        "target",
-    }
-)
+NAMES = (
+    "camera_file", "check", "ckpt", "data.images", "data.masks", "data.raw", "data.rgb", "data.root", "data.scene",
+    "data.split_file", "data.time_csv", "hydra.run.dir", "hydra.sweep.dir", "init.path", "poses.model", "source", "study.root",
+    "study.runs", "study.submission", "study.target", "table", "target",
+)  # fmt: skip
 
 
 def setting(key: str, value: Any) -> str:
