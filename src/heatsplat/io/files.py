@@ -9,6 +9,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+LONGEST_STEM = 200  # bytes that a file's name takes of an image's, which leaves room for what stands about it
+
 
 def by_numbers(name: str) -> list[str | int]:
     """What names are sorted by so that "image 2" comes before "image 10"."""
