@@ -44,16 +44,16 @@ def typed(argument: str) -> str:
 
 def with_names(overrides: Iterable[str]) -> list[str]:
     """Overrides with quotes about names of files, folders and scenes (``NAMES``) that Hydra would take for numbers, such as
-    data.scene=2024_08_07, one or several for a sweep."""
+    data.scene=2024_08_07; of several for a sweep, where all are."""
     return [_with_names(override) for override in overrides]
 
 
 def _with_names(override: str) -> str:
     key, _, value = override.partition("=")
     names = value.split(",")
-    if key_of(override) not in NAMES or not any(NUMBER.fullmatch(name) for name in names):
+    if key_of(override) not in NAMES or not all(map(NUMBER.fullmatch, names)):
         return override
-    return f"{key}={','.join(_quoted(name) if NUMBER.fullmatch(name) else name for name in names)}"
+    return f"{key}={','.join(map(_quoted, names))}"
 
 
 def key_of(override: str) -> str:
