@@ -270,6 +270,8 @@ def test_videos_are_checked(tmp_path, monkeypatch):
 
     with pytest.raises(ValueError, match="at least one frame"):
         write("v.mp4", [])
+    with pytest.raises(ValueError, match="the name is not UTF-8, which OpenCV cannot write to"):
+        write(os.fsdecode(b"M\xfcller.mp4"), [frame])
     with pytest.raises(ValueError, match=r"video frame 1 is uint8 \[16, 18, 3\], the first was uint8 \[16, 16, 3\]"):
         write("v.mp4", [frame, np.zeros((16, 18, 3), dtype=np.uint8)])
     with pytest.raises(ValueError, match=r"name the file \.mp4"):

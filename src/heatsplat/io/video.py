@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 
 from heatsplat.errors import check_option
+from heatsplat.io.files import utf8
 
 log = logging.getLogger("heatsplat")
 
@@ -37,7 +39,7 @@ def video(path: str | Path, fps: float = 24.0, codec: str = "auto") -> Iterator[
 
     Raises:
         ImportError: codec "h264" without the extra.
-        ValueError: no pictures, one of another size or type, or an unknown codec.
+        ValueError: no pictures, one of another size or type, an unknown codec, or a path that is not UTF-8 and not H.264.
         OSError: the file cannot be written, or not as a whole.
     """
     path = Path(path)
@@ -115,6 +117,11 @@ def _complete(path: Path) -> bool:
 
 
 def _opencv(path: Path, size: tuple[int, int], fps: float) -> tuple[Callable, Callable]:
+    if utf8(str(path)) != os.fsencode(path):  # which ends the process within OpenCV
+        raise ValueError(
+            f"{utf8(str(path)).decode()}: the name is not UTF-8, which OpenCV cannot write to: rename the folder, or install "
+            "H.264 by pip install 'heatsplat[video]'"
+        )
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
     if not writer.isOpened():
         raise OSError(f"cannot write {path}: this OpenCV has no MPEG-4 encoder or the folder is read-only")
