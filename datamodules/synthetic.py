@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -91,7 +92,8 @@ class Synthetic(SceneDataModule):
         self.drawn = None if number is None else drawn(number)
         outdoors = scene in YARDS or self.drawn is not None and isinstance(self.drawn.preset, OutdoorPreset)
         in_parts = split == "parts"
-        own_split = YARDS[scene][1].split if scene in YARDS else "json" if in_parts else "every_8th"
+        # The subsets of the frames ("json") are the parts, too.
+        own_split = "json" if in_parts else YARDS[scene][1].split if scene in YARDS else "every_8th"
         super().__init__(root=root, scene=scene, split=own_split if in_parts else split or own_split, **options)
         if scene not in PRESETS and not outdoors and self.drawn is None and number_of(scene, ROOM) is None:
             known = ", ".join((*PRESETS, *YARDS, *(f"{name}0, {name}1 and so on" for name in (ROOM, DRAWN))))
@@ -104,7 +106,7 @@ class Synthetic(SceneDataModule):
             raise SceneError(
                 f"data.hours={hours}: {' and '.join(OF_ANY_LENGTH)} know the hour of the day; leave it null elsewhere"
             )
-        pair = isinstance(hours, Sequence) and len(hours) == 2 and hours[0] != hours[1]
+        pair = isinstance(hours, Sequence) and len(hours) == 2 and hours[0] != hours[1] and list(hours) != [24, 0]
         if hours is not None and not (
             pair and all(isinstance(hour, int | float) and 0 <= hour <= 24 for hour in hours)
         ):
@@ -124,11 +126,11 @@ class Synthetic(SceneDataModule):
         self.noise_k = usual.noise_k if noise_k is None else noise_k
         self.bits = usual.bits if bits is None else bits
         self.pose_error_px = usual.pose_error_px if pose_error_px is None else pose_error_px
-        if not self.noise_k >= 0:
+        if not 0 <= self.noise_k < math.inf:
             raise SceneError(f"data.noise_k={noise_k}: the noise is a standard deviation in kelvin, 0 or more")
         if self.bits not in STORED:
             raise SceneError(f"data.bits={bits}: images are stored in 8 or 16 bits")
-        if not self.pose_error_px >= 0:
+        if not 0 <= self.pose_error_px < math.inf:
             raise SceneError(
                 f"data.pose_error_px={pose_error_px}: the error is a standard deviation in pixels, 0 or more"
             )

@@ -126,3 +126,20 @@ def test_a_scene_of_very_many_points_has_a_box(monkeypatch):
     known = many.box
     with_few_sorted(monkeypatch, 100)
     assert all(torch.allclose(one, other) for one, other in zip(many.box, known, strict=True))
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_the_length_unit_of_a_scene_is_one_of_its_own_wherever_its_cameras_stand(unit):
+    def extent(centres) -> float:
+        matrices = torch.eye(4, dtype=torch.float64).repeat(len(centres), 1, 1)
+        matrices[:, :3, 3] = -unit * torch.tensor(centres, dtype=torch.float64)
+        frames = [Frame(f"{i}.png", i, Camera(one, torch.eye(3), 8, 6)) for i, one in enumerate(matrices)]
+        views = ViewSet(frames, list)
+        return SceneData("a", views, views, views, unit * torch.tensor([[0.0, 0.0, 4.0]]).repeat(9, 1)).extent / unit
+
+    assert extent([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]) == pytest.approx(1.1)
+    assert extent([[0.0, 0.0, 0.0]] * 3) == pytest.approx(4.0)
+    assert extent([[0.1, 0.1, 0.0], [0.1, 0.1 + 1e-15, 0.0]]) == pytest.approx(
+        4.0, rel=1e-2
+    )  # a turning camera, rounded
+    assert extent([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]) == pytest.approx(0.055)

@@ -13,7 +13,7 @@ import torch
 from weathered import CAMERA, make_scene
 
 from heatsplat.contracts import Frame, SceneError, View, ViewSet
-from heatsplat.io.tiff import read_temperature
+from heatsplat.io.tiff import read_temperature, write_temperature
 from heatsplat.shots import (
     ShotFiles,
     checked_unseen,
@@ -354,6 +354,16 @@ def test_a_view_is_named_with_its_folder_where_the_name_alone_is_not_enough():
 )
 def test_files_of_no_two_frames_have_one_name(names, stems):
     assert list(file_stems(names).items()) == list(zip(names, stems, strict=True))
+
+
+def test_files_of_long_names_have_names_that_file_systems_take(tmp_path):
+    long = "雪" * 80
+    names = [f"{long}{i}.png" for i in range(2)] + [f"{folder}/{long}.png" for folder in "ab"]
+    for some in (names[:2], names):
+        stems = {*file_stems(some).values()}
+        assert len(stems) == len(some)
+        for stem in stems:
+            write_temperature(tmp_path / f"{stem}_uncertainty_0001.tiff", torch.zeros(2, 2))
 
 
 def test_images_of_one_name_have_files_of_their_own(tmp_path):

@@ -33,8 +33,13 @@ def parts_of(
         stretches: name -> [[from, to], ...] of the record, each as a share of it from its first frame to its last.
 
     Raises:
-        SceneError: no frame is left to train on, or a stretch is none.
+        SceneError: no frame is left to train on, or a share or stretch is none.
     """
+    if near < 1 or not 0 <= views < 1:
+        raise SceneError(
+            f"data.parts: near counts frames, from 1 on, and views is a share of them in [0, 1), got {near} and {views}; null "
+            "leaves either at its default"
+        )
     share = (times_s - times_s[0]) / max(times_s[-1] - times_s[0], 1e-12)
     parts = [TRAIN] * len(share)
     for name, bounds in stretches.items():

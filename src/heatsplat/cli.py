@@ -26,7 +26,8 @@ from omegaconf import DictConfig, OmegaConf
 from heatsplat.composition import CONF, build, options_of, plain, run_of
 from heatsplat.errors import SceneError, check_count, check_numbers, check_option, counted
 from heatsplat.explanations import expected, explain, sentence
-from heatsplat.io.files import size_told, write_atomically
+from heatsplat.io.command_lines import with_names
+from heatsplat.io.files import size_told, utf8, write_atomically
 from heatsplat.io.results import FAILED, METRICS_FILE
 from heatsplat.runs.lock import LOCK_FILE, OccupiedError, locked
 from heatsplat.runs.signals import stoppable
@@ -129,7 +130,8 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
 
 
 def _settings_first(arguments: Sequence[str]) -> list[str]:
-    """The arguments in an order that Hydra takes: settings have to stand together, and flags with their values follow.
+    """The arguments as Hydra takes them: settings have to stand together, flags with their values follow, and names that look
+    like numbers are quoted.
 
     Raises:
         SystemExit: there is no such flag, as of --seed=1; with a sentence.
@@ -149,7 +151,7 @@ def _settings_first(arguments: Sequence[str]) -> list[str]:
         flags.append(word)
         if known in WITH_VALUE and not given and left and not (known in OPTIONAL and "=" in left[0]):
             flags.append(left.pop(0))
-    return [*settings, *flags]
+    return [*with_names(settings), *flags]
 
 
 def _job(
@@ -180,7 +182,7 @@ def _job(
             cause = expected(error)
             if not isinstance(cause, OccupiedError):
                 with suppress(OSError):  # the disk may be full
-                    (output_dir / FAILED).write_text(traceback.format_exc())
+                    (output_dir / FAILED).write_bytes(utf8(traceback.format_exc()))
             if hydra_config.mode == RunMode.MULTIRUN or cause is None:
                 raise
             log.error("%s", sentence(cause))

@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError
 
 from heatsplat import CHECKOUT
+from heatsplat.io.command_lines import with_names
 from heatsplat.io.files import short_name
 from heatsplat.io.results import checkpoint_of
 from heatsplat.io.settings import at, walk
@@ -58,6 +59,7 @@ def compose(overrides: Sequence[str] = (), name: str = "train") -> dict[str, Any
         raise TypeError(
             f"compose takes a list of overrides, such as ['method=etgs', 'max_steps=2000'], got {overrides!r}"
         )
+    overrides = with_names(overrides)
     with _users_kept():
         return plain(compose_unresolved(overrides, name), overrides)
 

@@ -26,6 +26,7 @@ from torch import Tensor
 from heatsplat.errors import SceneError, check_count, check_numbers, check_option, counted, is_number, rounded  # noqa: F401
 
 SHARE_OF_RANGE = "share of the image's range"  # unit of a course in image units
+AT_ONE_PLACE = 1e-3  # radius of cameras in distances from what they see, below which it moves by about a pixel at most
 SORTED = 1 << 24  # values of which torch.quantile finds quantiles; it refuses more
 
 
@@ -472,10 +473,15 @@ class SceneData:
 
     @cached_property
     def extent(self) -> float:
-        """1.1 times the radius of the training cameras about their mean: the length unit of learning rates (3DGS)."""
+        """1.1 times the radius of the training cameras about their mean: the length unit of learning rates (3DGS).
+
+        Where they stand at one place, as on a tripod, it is their distance from the middle of the points: neither rounding nor
+        the unit of the world is a length of the scene.
+        """
         centers = torch.stack([frame.camera.center for frame in self.train.frames])
         radius = (centers - centers.mean(0)).norm(dim=1).max().item()
-        return 1.1 * radius if radius > 0 else 1.0
+        distance = self.distance if len(self.points) else 0.0
+        return 1.1 * radius if radius > AT_ONE_PLACE * distance else distance or 1.0
 
     @property
     def metadata(self) -> frozenset[str]:

@@ -16,7 +16,7 @@ from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseExceptio
 
 from heatsplat.composition import CONF, compose_unresolved, options_of
 from heatsplat.errors import SceneError
-from heatsplat.io.command_lines import as_dict, setting, typed
+from heatsplat.io.command_lines import PLAIN, as_dict, setting, typed
 from heatsplat.io.settings import walk
 
 # What a disk says that is full, may not be written to, or has a file where a folder is to be: no traceback helps.
@@ -187,7 +187,8 @@ def _quoted(override: str) -> str:
     if re.fullmatch(r"[+-]?\d+,\d+", value):
         return f"A number has a decimal point: {key}={value.replace(',', '.')}"
     if re.fullmatch(r"\[[^][{}'\"]*\]?", value):  # without its end where a shell took it apart at a space
-        words = [setting("", word.strip())[1:] for word in value.strip("[]").split(",") if word.strip()]
+        given = [word.strip() for word in value.strip("[]").split(",") if word.strip()]
+        words = [word if PLAIN.fullmatch(word) else setting("", word)[1:] for word in given]
         whole = ",".join([*words, *([] if value.endswith("]") else ["..."])])
         return f"A list is one argument, and text with = or umlauts in it takes quotes: {typed(f'{key}=[{whole}]')}"
     if not value or value[0] in "[{'\"":

@@ -29,6 +29,7 @@ from heatsplat.contracts import (
 )
 from heatsplat.geometry import trajectories
 from heatsplat.geometry.coverage import Sighting
+from heatsplat.io.files import LONGEST_STEM, short_name
 from heatsplat.io.pictures import THERMAL, Bar, Panel, bar_unit, compose, fitted, image_panel, write_figure, write_png
 from heatsplat.io.quantities import clock_of, moment
 from heatsplat.io.tiff import write_temperature
@@ -449,7 +450,7 @@ def file_stems(names: Sequence[str]) -> dict[str, str]:
 
 
 def _stem(path: Path) -> str:
-    return path.stem
+    return short_name(path.stem, LONGEST_STEM)
 
 
 def _with_folders(path: Path) -> str:
@@ -457,4 +458,4 @@ def _with_folders(path: Path) -> str:
 
 
 def _whole(path: Path) -> str:
-    return path.as_posix().replace("/", "_")
+    return short_name(path.as_posix().replace("/", "_"), LONGEST_STEM)

@@ -11,11 +11,13 @@ def test_hyperparameters_are_flat_and_say_what_was_learned():
         "seed": 3,
         "thermal": {"_target_": "heatsplat.thermal.newton_harmonic.NewtonHarmonic", "frequencies": 24, "grid": [1, 2]},
         "trainer": {"accelerator": "cpu"},
+        "data": {"scene": "M\udcfcller"},  # a byte that is no UTF-8, which TensorBoard refuses
     }
     flat = hyperparameters(config)
     assert flat == {
         "name": "etgs",
         "seed": 3,
+        "data.scene": r"M\udcfcller",
         "thermal": "NewtonHarmonic",
         "thermal.frequencies": 24,
         "thermal.grid": "[1, 2]",

@@ -221,6 +221,7 @@ def test_names_are_unique():
     scene = wall()
     frames = [*scene.train.frames, *scene.test.frames]
     assert len({file_stem(frame) for frame in frames}) == len(frames)
+    assert len(f"{file_stem(replace(frames[0], name='雪' * 84 + '.png'))}_clean.png".encode()) < 255
 
 
 def test_models_and_scenes_without_time_have_no_curves(tmp_path):

@@ -192,7 +192,7 @@ def test_images_of_some_hours_keep_the_days_that_are_held_out_and_the_weather_of
 
 
 def test_hours_are_those_of_a_day():
-    for hours in ((20,), (20, 25), (4, 4), 20, "night"):
+    for hours in ((20,), (20, 25), (4, 4), (24, 0), 20, "night"):
         with pytest.raises(SceneError, match=r"data.hours=.*the first and the last hour in UTC"):
             Synthetic(scene="outdoor", hours=hours)
     with pytest.raises(SceneError, match="outdoor and outdoor_true know the hour of the day"):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.parts import parts_of
 from heatsplat.datamodules.synthetic_scene.paths import camera_path, frame_times
 
@@ -34,3 +35,13 @@ def test_shares_that_leave_nothing_are_refused():
         parts_of(times, viewmats, gap=[[0.5, 0.2]])
     with pytest.raises(SceneError, match="leaves 0 of 19 frames"):
         parts_of(times, viewmats, all=[[0.0, 1.0]])
+    for wrong in ({"near": 0}, {"views": 1.5}, {"views": -0.1}):
+        with pytest.raises(SceneError, match="data.parts: near counts frames"):
+            parts_of(times, viewmats, **wrong)
+
+
+@pytest.mark.parametrize("scene", ["facade", "outdoor", "cooling"])
+def test_a_scene_in_parts_trains_on_its_training_part_alone(scene):
+    views = Synthetic(scene=scene, size="tiny", split="parts", parts={"near": 4}).scene
+    assert {frame.name.partition("_")[0] for frame in views.train.frames} == {"train"}
+    assert {frame.name.partition("_")[0] for frame in views.test.frames} == {"near", "views"}

@@ -347,6 +347,8 @@ def test_config_makes_the_module():
         ({"frames": 1}, "data.frames=1: a scene needs at least 2 frames"),
         ({"noise_k": -0.1}, "data.noise_k=-0.1"),
         ({"noise_k": float("nan")}, "data.noise_k=nan"),
+        ({"noise_k": float("inf")}, "data.noise_k=inf"),
+        ({"pose_error_px": float("inf")}, "data.pose_error_px=inf"),
     ],
 )
 def test_bad_options_are_named(options, message):

@@ -1,5 +1,8 @@
 """Files are written as a whole or not at all, and what is none is read as none."""
 
+import json
+import os
+
 import pytest
 
 from heatsplat.io.files import read_json_object, short_name, size_told, write_atomically
@@ -8,10 +11,16 @@ from heatsplat.io.files import read_json_object, short_name, size_told, write_at
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "metrics.json"
     write_atomically(path, "old")
-    with pytest.raises(UnicodeEncodeError):
-        write_atomically(path, "new \ud800")
+    with pytest.raises(TypeError):
+        write_atomically(path, 17)
     assert path.read_text() == "old"
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_name_that_is_no_utf_8_can_be_told(tmp_path):
+    name = os.fsdecode(b"M\xfcller")
+    write_atomically(tmp_path / "run.json", json.dumps({"scene": name}, ensure_ascii=False))
+    assert read_json_object(tmp_path / "run.json") == {"scene": name}
 
 
 @pytest.mark.parametrize("content", [None, b"{", b"[1]", b"3", b"\xff{}"])

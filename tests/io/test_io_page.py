@@ -4,6 +4,7 @@ import numpy as np
 from PIL import Image
 
 from heatsplat.io.page import page, write_page
+from heatsplat.io.pictures import write_png
 
 TEXT = """# etgs on <b>
 
@@ -40,3 +41,15 @@ def test_pictures_are_in_it_and_details_are_folded(tmp_path):
 def test_drawings_stay_drawings(tmp_path):
     (tmp_path / "a.svg").write_text("<svg/>")
     assert '<img src="data:image/svg+xml;base64,PHN2Zy8+" alt="drawn">' in page("# run\n\n![drawn](a.svg)\n", tmp_path)
+
+
+def test_pictures_of_any_size_are_in_it_and_damaged_ones_are_not(tmp_path, monkeypatch):
+    def shown(height: int, width: int) -> str:
+        write_png(tmp_path / "a.png", np.zeros((height, width, 3), np.uint8))
+        return page("# run\n\n![wide](a.png)\n", tmp_path)
+
+    assert 'width="16383" height="96"' in shown(100, 17000)  # three images of 5,500 pixels beside each other
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)  # of more than twice as many Pillow refuses to open a file
+    assert 'width="50" height="60"' in shown(60, 50)
+    (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:60])
+    assert "<img" not in page("# run\n\n![wide](a.png)\n", tmp_path)

@@ -26,6 +26,11 @@ def test_the_clock_stands_beside_a_time_where_it_is_known():
     assert Clock(1722965689.0, zone="").at(0.0, "seconds") == "2024-08-06 17:34:49"
 
 
+def test_times_that_no_calendar_has_are_told_without_a_date():
+    assert moment(1.72e12, Clock(1722965689.0)) == "19907407.41 d"  # milliseconds that were taken for seconds
+    assert moment(-1e18, Clock(1722965689.0)) == "-11574074074074.07 d"
+
+
 def test_the_clock_is_that_of_the_weather_or_of_the_camera():
     scene = replace(make_scene(), notes={"clock_at_zero_s": 5.0})
     assert clock_of(scene) is None  # whose weather counts from some zero of its own

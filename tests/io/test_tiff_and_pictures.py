@@ -1,5 +1,6 @@
 """Temperature files are bit-exact; pictures show the right colours at the right places."""
 
+import os
 import sys
 from dataclasses import replace
 
@@ -28,7 +29,7 @@ from heatsplat.io.pictures import (
     write_png,
 )
 from heatsplat.io.tiff import read_temperature, write_temperature
-from heatsplat.io.video import video
+from heatsplat.io.video import encoder, video
 
 RANGE = ThermalRange(10.0, 50.0)
 
@@ -52,11 +53,26 @@ def test_temperature_files_are_checked(tmp_path):
         write_temperature(tmp_path / "t.tiff", np.zeros((3, 4, 2)))
     with pytest.raises(ValueError, match=r"name the file \.tiff"):
         write_temperature(tmp_path / "t.png", np.zeros((3, 4)))
-    with pytest.raises(ValueError, match="cannot be read as an image"):
+    with pytest.raises(ValueError, match="cannot be read: No such file"):
         read_temperature(tmp_path / "missing.tiff")
+    for content in (b"", b"no picture"):
+        (tmp_path / "none.tiff").write_bytes(content)
+        with pytest.raises(ValueError, match="cannot be read as an image"):
+            read_temperature(tmp_path / "none.tiff")
     cv2.imwrite(str(tmp_path / "grey.tiff"), np.zeros((3, 4), dtype=np.uint8))
     with pytest.raises(ValueError, match="holds uint8"):
         read_temperature(tmp_path / "grey.tiff")
+
+
+@pytest.mark.parametrize("name", [b"M\xfcller", "Müller".encode(), b"a b'%04d"])
+def test_folders_of_temperatures_may_have_any_name(tmp_path, name):
+    folder = tmp_path / os.fsdecode(name)
+    try:
+        folder.mkdir()
+    except OSError:
+        pytest.skip("this file system has names in UTF-8 only")
+    write_temperature(folder / "t.tiff", np.arange(6.0).reshape(2, 3))
+    assert (read_temperature(folder / "t.tiff") == np.arange(6.0).reshape(2, 3)).all()
 
 
 def test_colours_are_those_of_matplotlib():
@@ -82,6 +98,8 @@ def test_ticks_lie_at_round_numbers_within_the_bar():
         labels = [float(text.replace("−", "-")) for _, text in _ticks(Bar(low, high, ""))]
         assert labels == pytest.approx(values, rel=1e-6, abs=1e-9)
     assert _ticks(Bar(5, 5, "°C")) == [(5, "5 °C")]
+    # Of values that are alike but for rounding there is no number between the ends.
+    assert _ticks(Bar(26.826345443725586, 26.826345443725586 + 2.2e-13, "°C")) == [(26.826345443725586, "26.8263 °C")]
 
 
 def test_the_picture_holds_the_image_and_the_bar():
@@ -105,6 +123,11 @@ def test_bars_of_thermal_images_say_whether_they_are_temperatures():
 
     assert units(grey, RANGE) == [None, "°C", "°C"] and units(grey, None) == [None, "image value", "image value"]
     assert units(colour, RANGE) == units(colour, None) == [None, None, ""]
+
+
+def test_wide_images_are_enlarged_to_a_width_that_a_page_can_have():
+    assert compose([Panel(np.zeros((4, 5000, 3), np.uint8), "scan")]).shape[1] == 5000 + 2 * GAP
+    assert compose([Panel(np.zeros((16, 100, 3), np.uint8), "scan")]).shape[1] == 1000 + 2 * GAP
 
 
 def test_comparison_shows_signed_errors_in_celsius():
@@ -216,6 +239,27 @@ def test_video_round_trip(tmp_path, codec):
     assert np.abs(read[0].astype(int) - frames[4]).mean() > 6
 
 
+@pytest.mark.parametrize("codec", ["mpeg4", "h264"])
+def test_a_video_that_the_disk_cut_off_is_told(tmp_path, monkeypatch, codec):
+    if codec == "h264":
+        pytest.importorskip("imageio_ffmpeg")
+    whole, left = encoder(codec), 0
+
+    def on_a_full_disk(path, *arguments):
+        add, close = whole(path, *arguments)
+        return add, lambda: (close(), os.truncate(path, path.stat().st_size * left // 100))
+
+    monkeypatch.setattr("heatsplat.io.video.encoder", lambda _: on_a_full_disk)
+    noise = np.random.default_rng(0).integers(0, 255, (64, 48, 3), np.uint8)
+    for left in (0, 30, 99):  # noqa: B007
+        with (
+            pytest.raises(OSError, match=r"not all of the video was written: '.*v\.mp4"),
+            video(tmp_path / "v.mp4", 10, codec) as add,
+        ):
+            for _ in range(5):
+                add(noise)
+
+
 def test_videos_are_checked(tmp_path, monkeypatch):
     frame = np.zeros((16, 16, 3), dtype=np.uint8)
 
@@ -226,6 +270,8 @@ def test_videos_are_checked(tmp_path, monkeypatch):
 
     with pytest.raises(ValueError, match="at least one frame"):
         write("v.mp4", [])
+    with pytest.raises(ValueError, match="the name is not UTF-8, which OpenCV cannot write to"):
+        write(os.fsdecode(b"M\xfcller.mp4"), [frame])
     with pytest.raises(ValueError, match=r"video frame 1 is uint8 \[16, 18, 3\], the first was uint8 \[16, 16, 3\]"):
         write("v.mp4", [frame, np.zeros((16, 18, 3), dtype=np.uint8)])
     with pytest.raises(ValueError, match=r"name the file \.mp4"):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from heatsplat.losses.masking import cleared, eroded, masked_mean
+from heatsplat.losses.masking import cleared, eroded, filled, masked_mean
 
 
 def test_masked_pixels_are_zero_and_get_no_gradient():
@@ -14,6 +14,17 @@ def test_masked_pixels_are_zero_and_get_no_gradient():
     found.square().sum().backward()
     assert image.grad.flatten().tolist() == [2.0, 0.0, 0.0, 4.0]
     assert cleared(image, None) is image
+
+
+def test_holes_are_filled_by_the_nearest_pixel_that_counts():
+    image = torch.arange(24.0).reshape(3, 4, 2)
+    mask = torch.ones(3, 4, dtype=torch.bool)
+    mask[:, 2:], mask[2, 3] = False, True
+    broken = image.masked_fill(~mask[..., None], torch.nan)
+    found = filled(broken, mask)
+    assert torch.equal(found[mask], image[mask]) and torch.equal(found[:2, 2], image[:2, 1])
+    assert torch.equal(found[1, 3], image[2, 3])
+    assert filled(image, None) is image and filled(broken, mask & False).abs().max() == 0
 
 
 def test_means_run_over_the_pixels_that_count_and_their_channels():

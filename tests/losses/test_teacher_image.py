@@ -106,6 +106,15 @@ def test_masked_pixels_pull_at_nothing_and_their_neighbours_at_the_target_alone(
     assert of_all.isfinite().all()
 
 
+@pytest.mark.parametrize("kernel", ["lanczos", "bicubic"])
+def test_a_hole_in_the_image_does_not_ring_in_what_is_taught_beside_it(kernel):
+    mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[5:8, 6:8] = False
+    flat = torch.full_like(FINE, 0.8)
+    terms = TeacherAndTarget(lambda: Interpolation(kernel), FACTOR)(inputs(flat, torch.full_like(COARSE, 0.8), mask))
+    assert sum(terms.values()).item() == pytest.approx(0.0, abs=1e-3)
+
+
 def test_what_cannot_be_is_named():
     with pytest.raises(ValueError, match=r"target_weight is a share of the loss in \[0, 1\] .* got 1.5, 4"):
         TeacherAndTarget(lambda: Given(TAUGHT), target_weight=1.5)

@@ -281,6 +281,17 @@ def test_what_is_refused_leaves_no_folder_unless_it_was_given_a_name(tmp_path, t
     assert (tmp_path / "run" / "FAILED").exists() and (tmp_path / "run" / "run.log").exists()
 
 
+def test_names_of_folders_may_look_like_numbers(tmp_path, told):
+    for name in ("2024_08_07", "17"):
+        (tmp_path / name).mkdir()
+    refused = ("train", "method=etgs", "data=colmap", "hydra.run.dir=1e3")
+    assert "data.root=/" in told(*refused, "data.root=2024_08_07", cwd=tmp_path, code=1)
+    assert "there is no such scene" in told(*refused, "data.root=.", "data.scene=1_8", cwd=tmp_path, code=1)
+    assert "data.scene=17: a sparse model" in told(*refused, "data.root=.", "data.scene=17", cwd=tmp_path, code=1)
+    assert (tmp_path / "1e3" / "FAILED").exists()
+    assert composition.compose(["data=colmap", "data.root=17", "data.scene=1_8"])["data"]["scene"] == "1_8"
+
+
 def test_what_wrote_something_before_it_failed_stays(tmp_path, told, monkeypatch):
     def fails(config, output_dir):
         (output_dir / "verdicts.md").touch()

@@ -216,6 +216,12 @@ def test_another_program_that_uses_hydra_composes_ours_and_goes_on_with_its_own(
         assert hydra.compose("theirs").mine == 1 and HydraConfig.get().job.config_name == "theirs"
 
 
+@pytest.mark.parametrize(("given", "told"), [(["test=true"], True), (["test=false"], False)])
+def test_a_run_whose_scores_would_be_in_no_file_is_warned_of(given, told, caplog):
+    checked(heatsplat.compose([*TINY, "method=3dgs", "callbacks.report=null", *given]))
+    assert ("leaves no metrics.json" in caplog.text) == told
+
+
 @pytest.mark.parametrize("overrides", ["method=etgs", [1], {"method": "etgs"}])
 def test_overrides_that_are_no_list_of_texts_are_refused(overrides):
     with pytest.raises(TypeError, match="compose takes a list of overrides"):

@@ -11,7 +11,7 @@ from heatsplat.callbacks.camera_check import OFF
 from heatsplat.composition import build, compose
 from heatsplat.contracts import Camera, Frame, SceneError
 from heatsplat.runs.run import load
-from heatsplat.training.cameras import Cameras, RefinedCameras, _common, _moved
+from heatsplat.training.cameras import Cameras, RefinedCameras, _common, _moved, check_sight
 
 FOCAL, SIDE = 100.0, 64
 
@@ -44,6 +44,19 @@ class Scene:
         self.frames = [Frame(f"{k}.png", 10 + k, one) for k, one in enumerate(cameras)]
         spread = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 0.5
         self.points = spread if points is None else points
+
+
+def test_a_world_that_is_too_small_to_be_seen_is_refused_and_one_that_is_in_part_is_told(tmp_path, caplog):
+    scene = Scene(ring(8))  # its points lie 1.1 to 2.9 away
+    check_sight(scene, 0.01)
+    assert not caplog.text
+    check_sight(scene, 1.7)
+    assert "% of its points nearer than renderer.near=1.7 world units" in caplog.text
+    with pytest.raises(SceneError, match=r"100 % of its points nearer .* lie 2 away\): give renderer.near=2e-02"):
+        check_sight(scene, 5.0)
+    check_sight(Scene(ring(8), torch.full((4, 3), 1e3)), 0.01)  # no camera sees any
+    with pytest.raises(SceneError, match=r"give renderer\.near="):
+        run(tmp_path, *TINY, *BARE, "method=3dgs", "renderer.near=30")
 
 
 def test_a_camera_turns_about_its_centre_and_moves_as_scipy_says():

@@ -1,6 +1,7 @@
 """Shadows and hidden sky by splatted depth, against what is known of a wall, a street and the yard's own rays."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, OutdoorScene
 from heatsplat.datamodules.synthetic_scene.shapes import trace
 from heatsplat.geometry.exposure import sun_directions
 from heatsplat.renderers.settings import Renderer
+from heatsplat.thermal.base import SUN_SEEN
 from heatsplat.training.exposure import Exposure
 from heatsplat.training.normals import Discs, Normals
 
@@ -58,6 +60,26 @@ def test_a_wall_shades_the_ground_as_far_as_its_height_says():
         assert lit[(normals[:, 0] > 0) & (means[:, 1].abs() < 3)].min() > 0.95  # the wall does not shade itself
         soft = lit[level & (means[:, 0] < -margin)].sum() * SPACING**2 / 6.0 - (8.0 - reach)
         assert abs(float(soft) + margin) < 0.4, height  # of metres of lit ground, in the mean
+
+
+def test_shadows_are_those_of_any_other_world_in_a_small_one():
+    ground = sheet((-8.0, -4.0, 0.0), (1.0, 0, 0), (0, 1.0, 0), (16.0, 8.0), (0.0, 0, 1))
+    wall = sheet((0.0, -4.0, 0.0), (0, 1.0, 0), (0, 0, 1.0), (8.0, 3.0), (1.0, 0, 0))
+    scene, discs = looked_at(ground, wall)
+    (means, quats, scales, opacities), unit = discs.shapes, 1e-5
+    names, renderer = (SUN_SEEN,), Renderer("cpu", near=1e-7)
+
+    def lit(scene, discs):
+        exposure = Exposure()
+        exposure.prepare(scene, renderer, discs, names)
+        return exposure.look(discs.shapes[0])[SUN_SEEN]
+
+    slanted = replace(scene.weather, sun=torch.nn.functional.normalize(torch.tensor([[1.0, 0, 1], [1, 0, 2]])).double())
+    scene = replace(scene, weather=slanted)
+    small = Discs((unit * means, quats, unit * scales, opacities), discs.normals)
+    known = lit(scene, discs)
+    assert known.min() < 0.05  # in the shadow of the wall
+    assert torch.allclose(lit(replace(scene, points=unit * means), small), known, atol=0.02)
 
 
 @pytest.mark.parametrize(("width", "height"), [(12.0, 12.0), (12.0, 6.0)])

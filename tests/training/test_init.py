@@ -39,6 +39,18 @@ def test_a_gaussian_is_as_large_as_the_distance_to_its_neighbours(parts):
     assert torch.allclose(splats.scales.detach(), 0.5 * size[:, None].expand(-1, 3), rtol=1e-5)
 
 
+def test_gaussians_of_a_small_world_are_as_large_in_it_as_in_any_other(parts):
+    scene, thermal = parts
+    dense = scene.points.repeat(4, 1) + 1e-3 * torch.rand(4 * len(scene.points), 3, generator=torch.manual_seed(0))
+
+    def sizes(scale: float) -> torch.Tensor:
+        small = replace(scene, points=scale * dense)
+        vars(small)["extent"] = scale * scene.extent  # of cameras that stand as much nearer
+        return Initialisation()(small, thermal, seed=0)[0].scales.detach() / scale
+
+    assert torch.allclose(sizes(0.01), sizes(1.0), rtol=1e-3)
+
+
 @pytest.mark.parametrize("wrapped", [False, True])
 @pytest.mark.parametrize(("asked", "opacity"), [(None, 0.25), (0.5, 0.5)])
 def test_gaussians_are_as_opaque_as_their_model_has_it_unless_asked(parts, wrapped, asked, opacity):

@@ -1,10 +1,12 @@
 """Normals of surfaces against truth on yard and room: which side area faces, and what keeps them up to date."""
 
+from dataclasses import replace
 from functools import cache
 
 import pytest
 import torch
 
+from heatsplat.contracts import ViewSet
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, OutdoorScene
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
@@ -97,3 +99,10 @@ def test_what_no_view_shows_keeps_its_normal():
 def test_options_out_of_range_are_refused(options):
     with pytest.raises(ValueError, match=r"normals\.views"):
         Normals(**options)
+
+
+def test_images_of_a_few_rows_are_looked_at_too():
+    scene = data(ROOM)
+    frames = [replace(frame, camera=frame.camera.resized(4 * frame.camera.width, 1)) for frame in scene.train.frames]
+    wide = replace(scene, train=ViewSet(frames, scene.train.__getitem__))
+    assert Normals(side=64).prepare(wide, Renderer("cpu"), scene.points).isfinite().all()

@@ -3,6 +3,8 @@
 It is torch's Adam with a step of its own on a CPU (tests/kernels/test_adam.py).
 """
 
+import math
+
 import pytest
 import torch
 
@@ -130,8 +132,15 @@ def test_a_run_goes_through_a_share_of_the_decay(decay, end):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"decay": -1}, "optim.means_end and decay must not be negative, got 0.01 and -1"),
-        ({"means_end": -1}, "optim.means_end and decay must not be negative, got -1 and 1.0"),
+        ({"decay": -1}, "optim.means_end, decay and length_power must not be negative, got 0.01, -1 and 0.0"),
+        ({"means_end": -1}, "optim.means_end, decay and length_power must not be negative, got -1, 1.0 and 0.0"),
+        (
+            {"length_power": -0.5},
+            "optim.means_end, decay and length_power must not be negative, got 0.01, 1.0 and -0.5",
+        ),
+        ({"accumulate": math.inf}, "optim.accumulate must be a number, got inf"),
+        ({"eps": math.inf}, "optim.eps must be a number, got inf"),
+        ({"decay": math.nan}, "optim.decay must be a number, got nan"),
         ({"betas": []}, r"optim.betas must be a list of 2 numbers, got \[\]"),
         ({"betas": [0.9, 1.0]}, r"optim.betas must lie in \[0, 1\)"),
         ({"eps": -1}, "optim.eps above 0, got .* and -1"),

@@ -9,6 +9,7 @@ import pytorch_lightning as pl
 import torch
 
 from heatsplat.contracts import SceneData
+from heatsplat.io.files import utf8
 from heatsplat.io.settings import walk
 from heatsplat.io.versions import processor
 
@@ -89,5 +90,5 @@ def hyperparameters(config: Mapping[str, Any]) -> dict[str, Any]:
         if key.endswith("._target_"):
             flat[key.removesuffix("._target_")] = str(value).split(".")[-1]
         elif not isinstance(value, Mapping):
-            flat[key] = value if isinstance(value, (int, float, str, bool)) else str(value)
+            flat[key] = value if isinstance(value, (int, float)) else utf8(str(value)).decode()
     return flat

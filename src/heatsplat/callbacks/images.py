@@ -12,6 +12,7 @@ from torch import Tensor
 
 from heatsplat.callbacks.board import add_picture
 from heatsplat.contracts import Frame, SceneData, SceneError, View, check_count, check_option, evenly_spread
+from heatsplat.io.files import LONGEST_STEM, short_name
 from heatsplat.io.pictures import (
     Panel,
     bounds_of,
@@ -173,4 +174,4 @@ def magnitudes(view: View, modality: str, prediction: Tensor, scene: SceneData) 
 
 def file_stem(frame: Frame) -> str:
     """A file name for pictures of a frame, unique in its scene whatever folders the images came from."""
-    return f"{frame.frame_id:04d}_{Path(frame.name).stem}"
+    return f"{frame.frame_id:04d}_{short_name(Path(frame.name).stem, LONGEST_STEM)}"

@@ -3,25 +3,57 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterable
 from typing import Any
 
 # Text that Hydra's grammar takes as it stands; it gives "=", ",", spaces, brackets and letters beyond ASCII a meaning or none.
 PLAIN = re.compile(r"[\w./-]+", re.ASCII)
+# What it takes for a number, with all that looks like one, such as the date 2024_08_07; and for nothing, true and false.
+NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)(e[+-]?\d[\d_]*)?|[+-]?(inf|nan)", re.ASCII | re.IGNORECASE)
+NO_TEXT = re.compile(r"null|true|false", re.IGNORECASE)
+# Settings that name a file, a folder or a scene, whatever it is called.
+NAMES = (
+    "camera_file", "check", "ckpt", "data.images", "data.masks", "data.raw", "data.rgb", "data.root", "data.scene",
+    "data.split_file", "data.time_csv", "hydra.run.dir", "hydra.sweep.dir", "init.path", "poses.model", "source", "study.root",
+    "study.runs", "study.submission", "study.target", "table", "target",
+)  # fmt: skip
 
 
 def setting(key: str, value: Any) -> str:
     """``key=value`` as an argument for Hydra: text that it would not take as it stands, such as many a path, in single quotes."""
+    if value is None or isinstance(value, int | float):
+        return f"{key}={'null' if value is None else str(value).lower()}"
     text = str(value)
-    if PLAIN.fullmatch(text):
-        return f"{key}={text}"
-    escaped = text.replace("'", "\\'")
-    return f"{key}='{escaped}'"
+    taken = PLAIN.fullmatch(text) and not NUMBER.fullmatch(text) and not NO_TEXT.fullmatch(text)
+    return f"{key}={text if taken else _quoted(text)}"
+
+
+def _quoted(text: str) -> str:
+    """A text in single quotes, before which backslashes are doubled."""
+    escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)
+    return "'" + re.sub(r"(\\+)$", r"\1\1", escaped) + "'"
 
 
 def typed(argument: str) -> str:
     """An argument as it is typed in a shell: in double quotes, which leave Hydra's own to Hydra, where that is needed."""
-    return argument if re.fullmatch(r"[\w./=-]+", argument, re.ASCII) else f'"{argument}"'
+    if re.fullmatch(r"[\w./=-]+", argument, re.ASCII):
+        return argument
+    return shlex.quote(argument) if re.search(r'[$`"\\!]', argument) else f'"{argument}"'
+
+
+def with_names(overrides: Iterable[str]) -> list[str]:
+    """Overrides with quotes about names of files, folders and scenes (``NAMES``) that Hydra would take for numbers, such as
+    data.scene=2024_08_07; of several for a sweep, where all are."""
+    return [_with_names(override) for override in overrides]
+
+
+def _with_names(override: str) -> str:
+    key, _, value = override.partition("=")
+    names = value.split(",")
+    if key_of(override) not in NAMES or not all(map(NUMBER.fullmatch, names)):
+        return override
+    return f"{key}={','.join(map(_quoted, names))}"
 
 
 def key_of(override: str) -> str:

@@ -9,6 +9,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+LONGEST_STEM = 200  # bytes that a file's name takes of an image's, which leaves room for what stands about it
+
 
 def by_numbers(name: str) -> list[str | int]:
     """What names are sorted by so that "image 2" comes before "image 10"."""
@@ -33,14 +35,23 @@ def short_name(name: str, most: int, whole: str | None = None) -> str:
     return name + mark
 
 
+def utf8(text: str) -> bytes:
+    """A text as UTF-8. What Python has for a byte of a file's name that is none becomes \\udcfc or the like, which JSON reads as
+    the same."""
+    return text.encode("utf-8", "backslashreplace")
+
+
 def write_atomically(path: str | Path, content: str | bytes | memoryview) -> None:
-    """Writes a file through a temporary one beside it, which is on the disk before it gets the name; makes its folder."""
+    """Writes a file through a temporary one beside it, which is on the disk before it gets the name; makes its folder.
+
+    Text is written as ``utf8`` has it.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with temporary.open("wb") as file:
-            file.write(content.encode("utf-8") if isinstance(content, str) else content)
+            file.write(utf8(content) if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

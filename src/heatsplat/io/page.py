@@ -9,6 +9,8 @@ import re
 from pathlib import Path
 from urllib.parse import unquote
 
+import cv2
+import numpy as np
 from markdown_it import MarkdownIt
 from PIL import Image
 
@@ -16,6 +18,7 @@ from heatsplat.io.files import write_atomically
 
 PAGE_FILE = "report.html"
 QUALITY = 85  # of WebP, of 100, for still pictures
+WEBP_SIDE = 16383  # pixels of a side, the most that WebP has
 FOLDED = ("The run", "Data: findings and assumptions", "Definitions of the scores", "Versions")
 STYLE = """
 :root { color-scheme: light dark; --paper: #ffffff; --ink: #1b1f24; --faint: #5d6672; --line: #e3e6ea; --accent: #b84a08; }
@@ -47,7 +50,7 @@ def write_page(path: Path, text: str) -> None:
 
 
 def page(text: str, folder: Path) -> str:
-    """The page of a report in Markdown whose pictures lie in ``folder``; those that do not are left out."""
+    """The page of a report in Markdown whose pictures lie in ``folder``; those that do not, or were damaged, are left out."""
     markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
     body = markdown.render(text)
     body = re.sub(
@@ -77,20 +80,33 @@ def plain(text: str) -> str:
 
 
 def _embedded(path: Path, alternative: str) -> str:
-    """A picture with its content in it; stills as WebP, moving ones and drawings (SVG) as they are."""
+    """A picture with its content in it; stills as WebP, moving ones and drawings (SVG) as they are. Empty where none can
+    be read."""
     if not path.exists():
         return ""
     content = path.read_bytes()
     if path.suffix == ".svg":
         return f'<img src="data:image/svg+xml;base64,{_base64(content)}" alt="{alternative}">'
-    with Image.open(io.BytesIO(content)) as picture:
-        width, height = picture.size
-        if not getattr(picture, "is_animated", False):
-            stored = io.BytesIO()
-            picture.convert("RGB").save(stored, "WEBP", quality=QUALITY, method=2)
-            content = stored.getvalue()
+    if path.suffix == ".png":  # by OpenCV: of more than 179 million pixels Pillow refuses a picture as an attack
+        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+        if pixels is None:
+            return ""
+        content, (width, height) = _as_webp(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+    else:
+        with Image.open(io.BytesIO(content)) as picture:
+            width, height = picture.size
+            if not getattr(picture, "is_animated", False):
+                content, (width, height) = _as_webp(np.asarray(picture.convert("RGB")))
     size = f'width="{width}" height="{height}"'
     return f'<img src="data:image/webp;base64,{_base64(content)}" alt="{alternative}" {size}>'
+
+
+def _as_webp(pixels: np.ndarray) -> tuple[bytes, tuple[int, int]]:
+    """A picture [H, W, 3] as a file, and its width and height: smaller where WebP knows none as large."""
+    picture, stored = Image.fromarray(pixels), io.BytesIO()
+    picture.thumbnail((WEBP_SIDE, WEBP_SIDE))
+    picture.save(stored, "WEBP", quality=QUALITY, method=2)
+    return stored.getvalue(), picture.size
 
 
 def _base64(content: bytes) -> str:

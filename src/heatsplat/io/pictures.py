@@ -39,7 +39,8 @@ GAP = 14
 BAR = 14
 ARROW = 9  # pixels of the triangle at an end of a bar beyond which there are values
 BLANK = 236  # grey of a cell without an image
-PANEL_HEIGHT = 260  # small images are enlarged by a whole factor to about this height
+PANEL_HEIGHT = 260  # small images are enlarged by a whole factor to about this height,
+WIDEST_PANEL = 1040  # and to about this width at most
 MARKS = "os^Dv<>P"  # of matplotlib, for many series in one figure
 TOLD_BEYOND = 0.05  # share of an image beyond an end of its bar from which the title says so
 FIGURE_PANEL = 1.8  # inches of height of an image in print
@@ -291,8 +292,9 @@ def fitted(picture: np.ndarray, height: int, width: int) -> np.ndarray:
 def _row(panels: Sequence[Panel]) -> np.ndarray:
     """Panels beside each other, each under its title, with a margin below only, uint8 RGB."""
     line = FONT + 9
-    factor = max(1, round(PANEL_HEIGHT / panels[0].image.shape[0]))
-    height, width = (side * factor for side in panels[0].image.shape[:2])
+    height, width = panels[0].image.shape[:2]
+    factor = max(1, round(min(PANEL_HEIGHT / height, WIDEST_PANEL / width)))
+    height, width = height * factor, width * factor
     ticks = [_ticks(panel.bar) if panel.bar else [] for panel in panels]
     labels = [max((_font(FONT).getlength(text) for _, text in marks), default=0) for marks in ticks]
     widths = [
@@ -412,7 +414,7 @@ def data_uri(picture: np.ndarray, quality: int = 85) -> str:
 
 def _ticks(bar: Bar) -> list[tuple[float, str]]:
     """Values at round numbers within the bar, with their labels; the unit stands at the uppermost."""
-    if not bar.high > bar.low:
+    if not bar.high - bar.low > 1e-9 * max(abs(bar.low), abs(bar.high)):  # apart by rounding, if at all
         return [(bar.low, f"{bar.low:g} {bar.unit}".strip())]
     steps = MaxNLocator(nbins=6, steps=[1, 2, 2.5, 5, 10]).tick_values(bar.low, bar.high)
     margin = 0.02 * (bar.high - bar.low)

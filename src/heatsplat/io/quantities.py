@@ -25,6 +25,7 @@ POSSIBLE = {
 }
 # Names of what the clocks of a record show at its second 0, and their zones; a camera's own is not known.
 CLOCKS = {"utc_at_zero_s": "UTC", "clock_at_zero_s": ""}
+YEARS_S = (-3.0e10, 2.53e11)  # seconds since 1970 of the years 1019 to 9987, which dates can have
 SUFFIXES = {
     "_c_per_h": "°C/h",
     "_k_per_kw_m2": "K m²/kW",
@@ -96,7 +97,9 @@ def clock_of(scene: SceneData) -> Clock | None:
 
 
 def moment(time_s: float, clock: Clock | None = None) -> str:
-    """A time of a record for people, such as "90.0 s", or "24.14 h (2024-08-07 09:12 UTC)" where its clock is known."""
+    """A time of a record for people, such as "90.0 s", or "24.14 h (2024-08-07 09:12 UTC)" where its clock is known and shows a
+    year of four digits."""
     unit_s, sign = time_unit(abs(time_s))
     told = f"{time_s / unit_s:.{1 if unit_s < 3600.0 else 2}f} {sign}"
-    return told if clock is None else f"{told} ({clock.at(time_s)})"
+    dated = clock is not None and YEARS_S[0] <= clock.at_zero_s + time_s < YEARS_S[1]
+    return f"{told} ({clock.at(time_s)})" if dated else told

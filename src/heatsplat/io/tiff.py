@@ -28,9 +28,12 @@ def write_temperature(path: str | Path, celsius: Any) -> None:
         raise ValueError(f"a temperature image is [H, W] or [H, W, 1], got {list(image.shape)}")
     if path.suffix.lower() not in (".tif", ".tiff"):
         raise ValueError(f"{path}: temperatures are written as float32 TIFF, name the file .tiff")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), np.ascontiguousarray(image)):
+    # Python writes the file: OpenCV takes no path that is not UTF-8, and on Windows none beyond the code page.
+    done, encoded = cv2.imencode(".tiff", np.ascontiguousarray(image))
+    if not done:
         raise OSError(f"cannot write {path}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(encoded)
 
 
 def read_temperature(path: str | Path) -> np.ndarray:
@@ -39,7 +42,11 @@ def read_temperature(path: str | Path) -> np.ndarray:
     Raises:
         ValueError: the file is missing, no image, or not one channel of float32.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    try:
+        content = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
     if image is None:
         raise ValueError(f"{path} cannot be read as an image")
     if image.dtype != np.float32 or image.ndim != 2:

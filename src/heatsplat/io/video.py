@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -14,6 +17,7 @@ import cv2
 import numpy as np
 
 from heatsplat.errors import check_option
+from heatsplat.io.files import utf8
 
 log = logging.getLogger("heatsplat")
 
@@ -35,8 +39,8 @@ def video(path: str | Path, fps: float = 24.0, codec: str = "auto") -> Iterator[
 
     Raises:
         ImportError: codec "h264" without the extra.
-        ValueError: no pictures, one of another size or type, or an unknown codec.
-        OSError: the file cannot be written.
+        ValueError: no pictures, one of another size or type, an unknown codec, or a path that is not UTF-8 and not H.264.
+        OSError: the file cannot be written, or not as a whole.
     """
     path = Path(path)
     if path.suffix.lower() != ".mp4":
@@ -68,6 +72,8 @@ def video(path: str | Path, fps: float = 24.0, codec: str = "auto") -> Iterator[
             close()
     if count == 0:
         raise ValueError(f"{path}: a video needs at least one frame")
+    if not _complete(path):  # of which neither encoder says a word
+        raise OSError(errno.ENOSPC, "not all of the video was written", str(path))
 
 
 def encoder(codec: str) -> Callable[[Path, tuple[int, int], float], tuple[Callable, Callable]]:
@@ -97,7 +103,25 @@ def encoder(codec: str) -> Callable[[Path, tuple[int, int], float], tuple[Callab
     return ffmpeg
 
 
+def _complete(path: Path) -> bool:
+    """Whether a file is a whole MPEG-4: boxes up to its end, with the index ("moov") among them."""
+    size, place, kinds = path.stat().st_size, 0, set()
+    with path.open("rb") as file:
+        while place < size:
+            file.seek(place)
+            length, kind = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
+            length = int.from_bytes(file.read(8), "big") if length == 1 else length or size - place
+            kinds.add(kind)
+            place += max(length, 8)
+    return place == size and b"moov" in kinds
+
+
 def _opencv(path: Path, size: tuple[int, int], fps: float) -> tuple[Callable, Callable]:
+    if utf8(str(path)) != os.fsencode(path):  # which ends the process within OpenCV
+        raise ValueError(
+            f"{utf8(str(path)).decode()}: the name is not UTF-8, which OpenCV cannot write to: rename the folder, or install "
+            "H.264 by pip install 'heatsplat[video]'"
+        )
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
     if not writer.isOpened():
         raise OSError(f"cannot write {path}: this OpenCV has no MPEG-4 encoder or the folder is read-only")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional
 
@@ -10,6 +11,14 @@ from torch.nn import functional
 def cleared(image: Tensor, mask: Tensor | None) -> Tensor:
     """The image [H, W, C] with 0 where the mask is False, whatever stands there, NaN too; no gradient goes through these."""
     return image if mask is None else torch.where(mask[..., None], image, 0.0)
+
+
+def filled(image: Tensor, mask: Tensor | None) -> Tensor:
+    """The image [H, W, C] with the nearest pixel that counts in place of each that does not; 0 throughout where none does."""
+    if mask is None or not bool(mask.any()):
+        return cleared(image, mask)
+    rows, columns = distance_transform_edt(~mask.cpu().numpy(), return_distances=False, return_indices=True)
+    return image[torch.from_numpy(rows), torch.from_numpy(columns)]
 
 
 def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from heatsplat.contracts import Frame, SceneData, SceneError, View
 from heatsplat.geometry.resampling import resampled
 from heatsplat.losses import swinir
+from heatsplat.losses.masking import filled
 
 log = logging.getLogger(__name__)
 
@@ -111,10 +112,11 @@ class TeacherImages:
 
     @torch.no_grad()
     def of(self, view: View, target: Tensor) -> tuple[Tensor, ...]:
-        """What is kept of a training image; the teacher is asked when it is first seen, with 0 for masked pixels."""
+        """What is kept of a training image; the teacher is asked when it is first seen. Masked pixels are filled for it: an edge
+        about them would ring in what counts beside."""
         key = view.frame.frame_id
         if key not in self._made:
-            target = torch.where(view.mask[..., None], target, 0.0) if view.mask is not None else target
+            target = filled(target, view.mask)
             fine = self._loaded()(target, view.frame, self.factor)
             self._made[key] = tuple(kept.half() for kept in self._make(fine, target))
         return self._made[key]

@@ -64,7 +64,7 @@ class Renderer:
     def seeing_far(self) -> Renderer:
         """The same renderer with no end of sight, for cameras far outside of the scene."""
         other = copy(self)
-        other.near, other.far = NEAR, FAR
+        other.near, other.far = min(self.near, NEAR), FAR  # in a small world even those may stand nearer than NEAR
         return other
 
     def background_of(self, scene: SceneData, modality: str) -> float:

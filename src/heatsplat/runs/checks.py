@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -18,6 +19,8 @@ from heatsplat.runs.budget import seconds_of
 from heatsplat.runs.declared import check_declared
 from heatsplat.runs.device import device_of
 from heatsplat.training.init import Pretrained, check_start
+
+log = logging.getLogger(__name__)
 
 # Learning rates in the group "optim"; elsewhere they are lr, lr_*.
 RATES = ("means", "log_scales", "quats", "opacity_logits")
@@ -50,6 +53,11 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
     _check_machine(config)
     if config["init"]["_target_"] == PRETRAINED and config["init"]["path"] is not None:
         check_start(config["init"]["path"])
+    if config["test"] and config["callbacks"].get("report") is None:
+        log.warning(
+            "callbacks.report=null leaves no metrics.json: tables of runs have no row of this one. callbacks.report.html=false "
+            "and callbacks.report.show=false leave out the page and the table on the screen"
+        )
     if config["budget"] is not None:
         config = config | {"budget": seconds_of(config["budget"])}
         if "max_steps" in keys_of(config["overrides"]):

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_count, check_numbers
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_count, check_numbers, evenly_spread, rounded
 from heatsplat.same_bits import mean
 
+log = logging.getLogger(__name__)
+
 FEWEST = 3  # images: of two, the common movement of all leaves nothing to learn
+SIGHT_VIEWS, SIGHT_POINTS = 16, 10_000  # images and points that tell whether a world is too small to be seen
+MUCH_UNSEEN = 0.05  # share of points nearer than a renderer shows, from which on the log tells
 ALIGN_PX = (0.1, 0.01)  # rate in pixels of the first and of the last step in which a camera is aligned to an image
 
 
@@ -178,16 +183,45 @@ def seen_depths(scene: SceneData) -> list[float]:
     """How far away what each training camera sees lies: the median depth of the scene's points in its image. Where there are
     none, that of all others, and of a scene without points its extent."""
     depths = []
-    for frame in scene.train.frames:
-        camera = frame.camera
-        pixels, z = camera.project(scene.points.double())
-        size = pixels.new_tensor([camera.width, camera.height])
-        seen = z[(z > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)]
-        depths.append(float(seen.median()) if len(seen) else math.nan)
+    for z in _depths(scene.train.frames, scene.points):
+        depths.append(float(z.median()) if len(z) else math.nan)
     usual = torch.tensor(depths).nanmedian().item()
     if math.isnan(usual):
         usual = scene.extent
     return [usual if math.isnan(depth) else depth for depth in depths]
+
+
+def check_sight(scene: SceneData, near: float) -> None:
+    """Raises SceneError where most of what training images show lies nearer than is rendered, as in a world of a few
+    thousandths of a unit; warns where a part does.
+
+    Args:
+        near: least camera z that is seen, in world units.
+    """
+    frames = [scene.train.frames[i] for i in evenly_spread(len(scene.train.frames), SIGHT_VIEWS)]
+    points = scene.points[torch.tensor(evenly_spread(len(scene.points), SIGHT_POINTS))]
+    depths = torch.cat(_depths(frames, points))
+    share = float((depths < near).double().mean()) if len(depths) else 0.0
+    if share <= MUCH_UNSEEN:
+        return
+    told = (
+        f"training cameras of scene '{scene.name}' have {100 * share:.0f} % of its points nearer than renderer.near={near:g} "
+        f"world units, where nothing is shown (in the middle they lie {rounded(float(depths.median()), 2)} away): give "
+        f"renderer.near={0.01 * float(depths.median()):.0e}"
+    )
+    if share > 0.5:
+        raise SceneError(told)
+    log.warning("%s", told)
+
+
+def _depths(frames: Sequence[Frame], points: Tensor) -> list[Tensor]:
+    """Depths of those points that lie in the image of each frame, float64."""
+    found = []
+    for frame in frames:
+        pixels, z = frame.camera.project(points.double())
+        size = pixels.new_tensor([frame.camera.width, frame.camera.height])
+        found.append(z[(z > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)])
+    return found
 
 
 def _focal(camera: Camera) -> float:

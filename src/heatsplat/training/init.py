@@ -27,7 +27,9 @@ log = logging.getLogger(__name__)
 
 NEIGHBOURS = 3  # a new splat is as large as the distance to its nearest points (Kerbl et al. 2023)
 OF_A_PLANE = 10  # points, itself among them, that tell the plane in which it lies
-MIN_SQUARED_DISTANCE = 1e-7
+# Distance to the nearest points from which a splat's size is taken, at least: in world units (Kerbl et al. 2023), and in
+# extents, which is less where a world is small.
+LEAST_DISTANCE, LEAST_OF_EXTENT = 1e-7**0.5, 1e-4
 LONE_SIZE = 0.1  # semi-axis in extents of a Gaussian that is the only one and has no neighbours
 ABSENT = -30.0  # logit of an opacity of 1e-13: what no renderer shows and no gradient reaches
 SAMPLED_VIEWS = 64  # image values at the points come from this many views at most, evenly spread
@@ -105,7 +107,7 @@ class Initialisation(Start):
         count, distances = len(means), neighbour_distances(means, NEIGHBOURS)
         if count == 1:
             distances = torch.full((1, 1), LONE_SIZE * scene.extent)
-        squared = distances.square().mean(1).clamp(min=MIN_SQUARED_DISTANCE)
+        squared = distances.square().mean(1).clamp(min=min(LEAST_DISTANCE, LEAST_OF_EXTENT * scene.extent) ** 2)
         opacity = thermal.start_opacity if self.opacity is None else self.opacity
         logit = torch.logit(torch.tensor(opacity))
         geometry = {

@@ -26,7 +26,7 @@ from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING
 from heatsplat.thermal.base import Rate, ThermalModel
 from heatsplat.training.adam import load_waiting_gradients, waiting_gradients
 from heatsplat.training.averaging import Average
-from heatsplat.training.cameras import Cameras
+from heatsplat.training.cameras import Cameras, check_sight
 from heatsplat.training.init import Start
 from heatsplat.training.loop import plain
 from heatsplat.training.optimisation import Optimisation, penalties
@@ -138,6 +138,8 @@ class SplatTraining(SceneModel):
         if self.scene is None:
             self.attach(self.trainer.datamodule.scene)
         if stage == "fit":
+            if self.thermal.rows != NOTHING:
+                check_sight(self.scene, self.renderer.near)
             for name in self.thermal.companions:
                 if not self.loss.compares(name):
                     log.warning("no term of loss.terms compares %s images: they are scored, but not learned", name)

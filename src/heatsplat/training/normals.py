@@ -124,9 +124,7 @@ def _reduced(frame: Frame, side: int) -> tuple[Frame, float]:
     """The frame on a grid of at most ``side`` pixels, and how many pixels of its own fit beside one of those."""
     camera = frame.camera
     ratio = max(1.0, max(camera.width, camera.height) / side)
-    if ratio == 1.0:
-        return frame, ratio
-    return replace(frame, camera=camera.resized(round(camera.width / ratio), round(camera.height / ratio))), ratio
+    return (frame, ratio) if ratio == 1.0 else (replace(frame, camera=camera.within(side)), ratio)
 
 
 def _gathered(show: Show, frame: Frame, ratio: float, map_: Tensor, like: Tensor) -> Tensor:

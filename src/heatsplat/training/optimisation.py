@@ -68,6 +68,15 @@ class Optimisation:
         averaged: float | None = 0.0,
         decoupled: DecoupledDecay | None = None,
     ) -> None:
+        given = {
+            "length_power": length_power,
+            "means_end": means_end,
+            "decay": decay,
+            "eps": eps,
+            "accumulate": accumulate,
+        }
+        for name, value in given.items():
+            check_numbers(f"optim.{name}", value)
         if accumulate < 1:
             raise ValueError(f"optim.accumulate is a number of views and at least 1, got {accumulate}")
         if not 0 <= accumulate_from <= 1:
@@ -76,8 +85,10 @@ class Optimisation:
             raise ValueError(f"optim.averaged is a share of the run, from 0 to 1, or null, got {averaged}")
         if steps < 1:
             raise ValueError(f"optim.steps must be at least 1, got {steps}")
-        if min(means_end, decay) < 0:
-            raise ValueError(f"optim.means_end and decay must not be negative, got {means_end} and {decay}")
+        if min(means_end, decay, length_power) < 0:
+            raise ValueError(
+                f"optim.means_end, decay and length_power must not be negative, got {means_end}, {decay} and {length_power}"
+            )
         check_numbers("optim.betas", betas, 2)
         if not all(0 <= beta < 1 for beta in betas) or eps <= 0:
             raise ValueError(f"optim.betas must lie in [0, 1) and optim.eps above 0, got {list(betas)} and {eps}")
