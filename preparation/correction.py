@@ -414,9 +414,8 @@ def _unsettled(few: Sequence[tuple[Camera, Tensor]], points: Tensor) -> str:
 def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels (column, row) [n, 2] of the points that lie in an image, and which these are, [P] bool."""
     places, depths = camera.project(points)
-    at = places.floor()
-    within = (depths > 0) & (at >= 0).all(1) & (at < at.new_tensor([camera.width, camera.height])).all(1)
-    return at[within].long(), within
+    within = camera.inside(places, depths)
+    return places[within].floor().long(), within
 
 
 def _recorded(folders: Sequence[Path]) -> dict[str, dict[str, str]]:

@@ -128,6 +128,12 @@ class Camera:
         local = points.to(viewmat) @ viewmat[:3, :3].T + viewmat[:3, 3]
         return (local @ K.T)[:, :2] / local[:, 2:].clamp_min(1e-12), local[:, 2]
 
+    def inside(self, pixels: Tensor, depths: Tensor, margin: float = 0.0) -> Tensor:
+        """Which points lie in the image, [n] bool, by what ``project`` says of them: before the camera, and at least ``margin``
+        pixels from the border."""
+        size = pixels.new_tensor([self.width, self.height])
+        return (depths > 0) & (pixels >= margin).all(1) & (pixels < size - margin).all(1)
+
     def resized(self, width: int, height: int) -> Camera:
         """The same camera on a grid of ``width`` x ``height`` pixels; intrinsics scale by the actual pixel counts."""
         scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=torch.float64)

@@ -334,8 +334,7 @@ def depth_beside(
     points, found = scene.points[evenly_spread(len(scene.points), DEPTH_POINTS)], []
     for frame in frames:
         pixels, depths = frame.camera.project(points)
-        size = pixels.new_tensor([frame.camera.width, frame.camera.height])
-        found.append(depths[(depths > 0) & (pixels > 0).all(1) & (pixels < size).all(1)])
+        found.append(depths[frame.camera.inside(pixels, depths)])
     seen = torch.cat(found)
     seen = seen if len(seen) else seen.new_tensor([scene.distance])  # no point is in sight
     low, high = (scale * quantile(seen, seen.new_tensor(DEPTH_ENDS))).tolist()

@@ -67,6 +67,5 @@ class CameraCheck(pl.Callback):
 def _moved_px(camera: Camera, other: Camera, points: torch.Tensor) -> float:
     """By how many pixels of a camera another sees the scene's points beside, in the median of those in its image; 0 of none."""
     (pixels, depths), (beside, _) = camera.project(points.double()), other.project(points.double())
-    inside = (pixels >= 0).all(1) & (pixels < pixels.new_tensor([camera.width, camera.height])).all(1) & (depths > 0)
-    apart = (beside - pixels)[inside].norm(dim=1)
+    apart = (beside - pixels)[camera.inside(pixels, depths)].norm(dim=1)
     return float(apart.median()) if len(apart) else 0.0

@@ -170,8 +170,7 @@ class TemperatureCurves(pl.Callback):
 def seen_by(camera: Camera, points: Tensor, cloud: Tensor) -> Tensor:
     """Which points [n, 3] the camera sees, [n] bool: in the image and not behind points of the cloud [P, 3]."""
     pixels, depths = camera.project(points)
-    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-    inside = (depths > 0) & (pixels >= 1).all(1) & (pixels < size - 1).all(1)
+    inside = camera.inside(pixels, depths, margin=1)
     others, other_depths = camera.project(cloud)
     for i in inside.nonzero()[:, 0].tolist():
         near = ((others - pixels[i]).abs() < NEAR_PIXELS * camera.width).all(1)

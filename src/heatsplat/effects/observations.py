@@ -191,8 +191,7 @@ def frames_to_follow(frames: Sequence[Frame], points: Tensor, limit: int) -> lis
 
 def in_view(points: Tensor, camera: Camera) -> Tensor:
     """Which points [P, 3] lie in a camera's field of view, [P] bool."""
-    pixels, depth = camera.project(points)
-    return (depth > 0) & (pixels > 0).all(1) & (pixels < pixels.new_tensor([camera.width, camera.height])).all(1)
+    return camera.inside(*camera.project(points))
 
 
 def _stands_still(cameras: Sequence[Camera], points: Tensor) -> bool:

@@ -219,8 +219,7 @@ def _depths(frames: Sequence[Frame], points: Tensor) -> list[Tensor]:
     found = []
     for frame in frames:
         pixels, z = frame.camera.project(points.double())
-        size = pixels.new_tensor([frame.camera.width, frame.camera.height])
-        found.append(z[(z > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)])
+        found.append(z[frame.camera.inside(pixels, z)])
     return found
 
 

@@ -243,8 +243,7 @@ def _check_world(path: Path, means: Tensor, scene: SceneData) -> None:
     seen = torch.zeros(len(means), dtype=torch.bool)
     for position in evenly_spread(len(scene.train), SAMPLED_VIEWS):
         camera = scene.train.frames[position].camera
-        pixels, depths = camera.project(means)
-        seen |= (depths > 0) & (pixels > 0).all(1) & (pixels < pixels.new_tensor([camera.width, camera.height])).all(1)
+        seen |= camera.inside(*camera.project(means))
     share = float(seen.double().mean())
     remedy = "give a .ply or a checkpoint in the coordinates of this scene, or take init=sfm"
     if share == 0:
