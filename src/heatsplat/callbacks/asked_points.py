@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import csv
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,10 +11,10 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Frame, SceneData, SceneError
-from heatsplat.io.tables import read_csv
 
 OPTION = "callbacks.probes.points"
 PLACE, PIXEL = ("x", "y", "z"), ("view", "row", "column")
+FARTHEST = 1e12  # beyond lie no coordinates
 
 
 @dataclass(frozen=True)
@@ -51,37 +52,35 @@ def asked_points(path: Path | str, scene: SceneData) -> list[AskedPoint]:
 
     Args:
         path: CSV with the columns x, y, z in the coordinates of the data set, or view, row, column of a pixel of a frame (its
-            name, and whole numbers from 0 at the top left); name may be left out. What probe_positions.csv has will do.
+            name, and whole numbers from 0 at the top left); name may be left out. What probe_positions.csv has will do, and
+            columns apart by semicolon or tab, with decimal commas.
         scene: whose points they are.
 
     Raises:
         SceneError: there is no such table, it has other columns, or a row that is no point; file and row are named.
     """
-    try:
-        rows = read_csv(Path(path).expanduser())
-    except (OSError, ValueError) as error:
-        raise SceneError(f"{OPTION}={path} cannot be read: {error}") from error
+    rows = _rows(path)
     if not rows:
         raise SceneError(f"{OPTION}={path} has no point: a line of column names and one line for each point are needed")
     columns = next((needed for needed in (PLACE, PIXEL) if set(needed) <= rows[0].keys()), None)
     if columns is None:
         raise SceneError(
-            f"{OPTION}={path} has the columns {', '.join(map(str, rows[0]))}; {', '.join(PLACE)} or {', '.join(PIXEL)} are needed"
+            f"{OPTION}={path} has the columns {', '.join(rows[0])}; {', '.join(PLACE)} or {', '.join(PIXEL)} are needed"
         )
     frames = {frame.name: frame for frame in scene.frames}
     found = []
     for number, row in enumerate(rows, 1):
-        where, name = f"{OPTION}={path}, row {number}", _text(row.get("name")) or f"point {number}"
+        where, name = f"{OPTION}={path}, row {number}", row.get("name") or f"point {number}"
         if columns == PLACE:
-            place = torch.tensor(_numbers(row, PLACE, where), dtype=torch.float64)
+            place = torch.tensor([_number(row, key, where) for key in PLACE], dtype=torch.float64)
             found.append(AskedPoint(name, place - scene.origin))
             continue
-        frame = frames.get(_text(row["view"]))
+        frame = frames.get(row["view"])
         if frame is None:
             raise SceneError(
                 f"{where}: '{row['view']}' is no frame of scene '{scene.name}'; names look like {next(iter(frames))}"
             )
-        at_row, at_column = (int(value) for value in _numbers(row, PIXEL[1:], where))
+        at_row, at_column = (int(_number(row, key, where)) for key in PIXEL[1:])
         if not (0 <= at_row < frame.camera.height and 0 <= at_column < frame.camera.width):
             raise SceneError(
                 f"{where}: row {at_row}, column {at_column} lies outside of {frame.name}, which has {frame.camera.height} rows "
@@ -94,14 +93,24 @@ def asked_points(path: Path | str, scene: SceneData) -> list[AskedPoint]:
     return found
 
 
-def _text(cell: float | str | None) -> str:
-    """What a cell says, where that is a name: one of digits alone was read as a number."""
-    return "" if cell is None else cell if isinstance(cell, str) else f"{cell:.12g}"
+def _rows(path: Path | str) -> list[dict[str, str]]:
+    """The rows of a table by column, as text. Raises SceneError where it cannot be read."""
+    try:
+        lines = Path(path).expanduser().read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{OPTION}={path} cannot be read: {error}") from error
+    apart = max(",;\t", key=(lines or [""])[0].count)
+    head, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=apart) if row] or [[]]
+    if wrong := next((number for number, row in enumerate(rows, 1) if len(row) != len(head)), None):
+        raise SceneError(f"{OPTION}={path}, row {wrong}: {len(rows[wrong - 1])} cells for {len(head)} columns")
+    return [dict(zip(head, row, strict=True)) for row in rows]
 
 
-def _numbers(row: dict[str, float | str | None], keys: Sequence[str], where: str) -> list[float]:
-    values = [row[key] for key in keys]
-    wrong = [k for k, value in enumerate(values) if not isinstance(value, float) or not abs(value) < 1e12]
-    if wrong:
-        raise SceneError(f"{where}: {keys[wrong[0]]} is {values[wrong[0]]!r}, a number is needed")
-    return values
+def _number(row: dict[str, str], key: str, where: str) -> float:
+    try:
+        number = float(row[key].replace(",", "."))
+    except ValueError:
+        number = float("nan")
+    if not abs(number) < FARTHEST:
+        raise SceneError(f"{where}: {key} is '{row[key]}', a number is needed")
+    return number

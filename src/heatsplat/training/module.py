@@ -124,9 +124,8 @@ class SplatTraining(SceneModel):
         self._rendered: tuple[RenderOutput, Camera] | None = None
         self._pixels = 0  # of the last target
         self._checked_trained = False  # after the first step, which may make parameters
-        self._updated = (
-            True  # in the last step; else its gradients wait, whatever a plan that was moved since says of it
-        )
+        # Whether the last step updated; else its gradients wait, whatever a plan that was moved since says of it.
+        self._updated = True
         self._average = Average()
         self._averaged = thermal.averaged if optim.averaged is None else optim.averaged
         self._waiting: dict[str, Any] = {}  # gradients of a checkpoint that was written between two updates
