@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from layouts import grey, names, rhd_names, write_colmap, write_image, write_rhd
 
+from heatsplat.callbacks.asked_points import asked_points
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.nerfstudio import THERMAL_KEYS, VISIBLE_KEYS
 from heatsplat.datamodules.nerfstudio import Nerfstudio
@@ -32,6 +33,8 @@ def test_every_example_is_tried():
         "meta.json",
         "weather.csv",
         "info.json",
+        "points.csv",
+        "pixels.csv",
     }
     assert set(EXAMPLES) == tried
 
@@ -66,6 +69,16 @@ def test_the_weather_example(tmp_path, table):
     if table:
         assert scene.weather.notes["latitude"] == 50.1 and scene.weather.direct_w_m2 is not None
         assert scene.train.frames[1].environment.irradiance_w_m2 == pytest.approx(700.0)
+
+
+def test_the_points_of_curves(tmp_path):
+    write_colmap(tmp_path, FILES)
+    put(tmp_path, "points.csv", "pixels.csv")
+    scene = Colmap(root=str(tmp_path)).scene
+    places, pixels = (asked_points(tmp_path / name, scene) for name in ("points.csv", "pixels.csv"))
+    assert [one.name for one in places] == [one.name for one in pixels] == ["stove", "window"]
+    assert places[1].point.tolist() == [1.05, 0.44, 2.1]
+    assert [(one.frame.name, one.row, one.column) for one in pixels] == [(FILES[0], 12, 30), (FILES[1], 5, 8)]
 
 
 def test_the_rhd_example(tmp_path):

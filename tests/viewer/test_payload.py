@@ -12,7 +12,7 @@ import torch
 from exported import started
 from swinging import frames, ready, wall
 
-from heatsplat.contracts import Camera, Frame
+from heatsplat.contracts import Camera, Frame, SceneData
 from heatsplat.export.snapshot import snapshot
 from heatsplat.sensors.base import SensorChain
 from heatsplat.sensors.rolling_readout import RollingReadout
@@ -101,6 +101,7 @@ def test_the_same_images_tell_the_time_however_a_scene_is_split():
 )
 def test_the_clock_is_that_of_the_weather_or_of_the_frames(weather, notes, told):
     scene = SimpleNamespace(weather=weather and SimpleNamespace(notes=weather), notes=notes)
+    scene.clock_at_zero_s = SceneData.clock_at_zero_s.fget(scene)
     assert _clock(scene) == told
 
 
