@@ -95,9 +95,8 @@ def shot_frames(
     else:
         shown = _moving(scene, trajectory, count, cameras)
         own = [frame.time_s for frame in cameras] if trajectory == "path" else []
-        if (
-            time is None and own and None not in own
-        ):  # equal shares of the frames between neighbours, as their places have
+        if time is None and own and None not in own:
+            # Equal shares of the frames between neighbours, as their places have.
             moments = np.interp(np.linspace(0, len(own) - 1, count), range(len(own)), own).tolist()
         time = scene.middle_s if time is None else time
     shown = [camera.resized(finer * camera.width, finer * camera.height) for camera in shown]
