@@ -348,7 +348,7 @@ def test_the_hottest_and_the_coldest_spot_are_those_of_the_picture(page):
     shown = page.execute_script("return [...document.querySelectorAll('#marks text')].map((one) => one.textContent)")
     assert f"hot {hot['value']:.2f} °C" in shown and f"cold {cold['value']:.2f} °C" in shown
     keys(page, "x")
-    assert page.execute_script("return document.querySelectorAll('#marks .spot').length") == 0
+    wait_until(page, "document.querySelectorAll('#marks .spot').length === 0")  # by the next frame
 
 
 def test_spots_of_what_was_learned_are_those_of_the_whole_picture(page):
