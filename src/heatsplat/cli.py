@@ -304,11 +304,11 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 
     from heatsplat.export.formats.base import checked_range
     from heatsplat.export.place import placed, unit_in_metres
+    from heatsplat.io.pictures import checked_colormap
     from heatsplat.io.video import CODECS, encoder
     from heatsplat.shots import (
         ShotFiles,
         check_shot,
-        checked_colormap,
         checked_unseen,
         depth_beside,
         shot_frames,

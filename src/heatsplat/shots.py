@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import csv
-import difflib
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
-import matplotlib
 import numpy as np
 import torch
 from torch import Tensor
@@ -132,14 +130,6 @@ def checked_unseen(name: str, value: str | float) -> str:
     word = "nan" if value != value else value
     check_option(name, word, UNSEEN, SceneError)
     return word
-
-
-def checked_colormap(name: str, value: str) -> str:
-    """A name of a matplotlib map. Raises SceneError with the option's ``name``, and names that are alike, where there is none."""
-    if value not in matplotlib.colormaps:
-        alike = difflib.get_close_matches(str(value), matplotlib.colormaps) or ["gray", "turbo", "viridis"]
-        raise SceneError(f"{name}={value} is no map of matplotlib, as {', '.join([THERMAL, *alike])} are")
-    return value
 
 
 def first_free_id(scene: SceneData) -> int:
@@ -337,10 +327,8 @@ def depth_beside(
     seen = torch.cat(found)
     seen = seen if len(seen) else seen.new_tensor([scene.distance])  # no point is in sight
     low, high = (scale * quantile(seen, seen.new_tensor(DEPTH_ENDS))).tolist()
-    low, high = (
-        (1.0 - DEPTH_MARGIN) * low,
-        (1.0 + DEPTH_MARGIN) * high,
-    )  # rendered surfaces of flat ground lie beside it
+    # Rendered surfaces of flat ground lie a little beside its points.
+    low, high = (1.0 - DEPTH_MARGIN) * low, (1.0 + DEPTH_MARGIN) * high
 
     def values(frame: Frame) -> Tensor:
         depth = scale * depth_of(frame)
@@ -380,7 +368,7 @@ def write_shot(
         range_c: °C at the ends of the colours; None takes the scene's range.
         titles: of images in pictures, by name; others have their name.
         beside: what else is written of each frame.
-        colormap: name of the matplotlib map that colours temperatures (``checked_colormap``).
+        colormap: name of the matplotlib map that colours temperatures (``io.pictures.checked_colormap``).
     """
     bounds = scene.thermal_range
     if bounds is None:

@@ -1,6 +1,7 @@
 """Curves of the points that a table names, in the coordinates of the data set or by the pixel in which they lie."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,7 +14,9 @@ from heatsplat.io.tables import read_csv
 
 
 class Deep(FakeModule):
-    """Knows where the wall is."""
+    """Knows where the wall and its cameras are."""
+
+    cameras = SimpleNamespace(of=lambda frame: frame.camera)
 
     def depth(self, frame):
         return torch.full((frame.camera.height, frame.camera.width), 4.0)
@@ -106,4 +109,4 @@ def test_a_pixel_without_a_surface_has_no_place(tmp_path):
     frame = wall().train.frames[0]
     (tmp_path / "points.csv").write_text(f"view,row,column\n{frame.name},20,5\n")
     (one,) = asked_points(tmp_path / "points.csv", wall())
-    assert one.placed(lambda frame: torch.full((40, 56), torch.inf)) is None
+    assert one.placed(lambda frame: torch.full((40, 56), torch.inf), lambda frame: frame.camera) is None

@@ -8,6 +8,7 @@ from running import TINY
 
 from heatsplat.composition import compose
 from heatsplat.contracts import SceneError
+from heatsplat.export.formats.mesh import Mesh
 from heatsplat.export.formats.ply import Ply
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.io.pictures import colorize
@@ -44,5 +45,9 @@ def test_what_cannot_be_coloured_is_said(cooling, tmp_path):
         Ply(colormap="rgb").write(cooling, tmp_path / "a.ply")
     with pytest.raises(SceneError, match=r"what.colormap=infrno is no map of matplotlib"):
         Ply(colormap="infrno").write(cooling, tmp_path / "a.ply")
+    with pytest.raises(
+        SceneError, match=r"what.colormap=rgb is no map of matplotlib"
+    ):  # of a mesh, which has no Gaussians
+        Mesh(mesh="a.ply", colormap="rgb")
     with pytest.raises(SceneError, match=r"what.range_c must be two increasing numbers"):
         Ply(range_c=[40.0, 20.0]).write(cooling, tmp_path / "a.ply")

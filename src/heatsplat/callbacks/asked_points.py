@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Frame, SceneData, SceneError
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError
 
 OPTION = "callbacks.probes.points"
 PLACE, PIXEL = ("x", "y", "z"), ("view", "row", "column")
@@ -33,12 +33,12 @@ class AskedPoint:
     row: int = 0
     column: int = 0
 
-    def placed(self, depth_of: Callable[[Frame], Tensor]) -> Tensor | None:
+    def placed(self, depth_of: Callable[[Frame], Tensor], camera_of: Callable[[Frame], Camera]) -> Tensor | None:
         """[3] float64: where the table has no place, on the surface that ``depth_of`` [H, W] (camera z, infinite without one)
-        knows of the frame; None where that pixel shows none."""
+        knows of the frame, from where ``camera_of`` has its camera stand; None where that pixel shows none."""
         if self.point is not None:
             return self.point
-        camera = self.frame.camera
+        camera = camera_of(self.frame)
         depth = float(depth_of(self.frame)[self.row, self.column])
         if not depth < float("inf"):
             return None

@@ -7,6 +7,7 @@ tenths of a second; the colour maps and the tick positions are matplotlib's.
 from __future__ import annotations
 
 import base64
+import difflib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw, ImageFont
 
-from heatsplat.contracts import ThermalRange
+from heatsplat.contracts import SceneError, ThermalRange
 
 THERMAL = "inferno"
 ERROR = "RdBu_r"  # red: rendered too warm, blue: too cold
@@ -50,6 +51,14 @@ FIGURE_PANEL = 1.8  # inches of height of an image in print
 def lut(name: str) -> np.ndarray:
     """The 256 colours of a matplotlib map, uint8 [256, 3]."""
     return matplotlib.colormaps[name](np.arange(256), bytes=True)[:, :3]
+
+
+def checked_colormap(name: str, value: str) -> str:
+    """A name of a matplotlib map. Raises SceneError with the option's ``name``, and names that are alike, where there is none."""
+    if value not in matplotlib.colormaps:
+        alike = difflib.get_close_matches(str(value), matplotlib.colormaps) or ["gray", "turbo", "viridis"]
+        raise SceneError(f"{name}={value} is no map of matplotlib, as {', '.join([THERMAL, *alike])} are")
+    return value
 
 
 @cache

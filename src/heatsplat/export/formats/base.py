@@ -13,7 +13,7 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.export.moment import Moment
-from heatsplat.io.pictures import colorize
+from heatsplat.io.pictures import checked_colormap, colorize
 
 # Columns that files have of every model: a model's attribute of such a name must not stand in their place.
 OWN_COLUMNS = frozenset({"temperature", "value", "opacity"})
@@ -47,27 +47,27 @@ class Coloured(Format):
     Args:
         colormap: name of a matplotlib map; "rgb" takes the visible colours of methods that have them.
         range_c: °C at the ends of the map; None takes those that an image of the scene can show.
+
+    Raises:
+        SceneError: there is no such map, or ``range_c`` is none.
     """
 
     def __init__(self, colormap: str = "inferno", range_c: Sequence[float] | None = None) -> None:
-        self.colormap, self.range_c = colormap, checked_range(range_c)
+        self.colormap = colormap if colormap == "rgb" else checked_colormap("what.colormap", colormap)
+        self.range_c = checked_range(range_c)
 
     def colours(self, moment: Moment) -> np.ndarray:
         """Colours [N, 3] float32 in [0, 1] of the Gaussians' values, or of the visible image.
 
         Raises:
-            SceneError: the model has no colours, or there is no such map.
+            SceneError: the model has no colours.
         """
         if self.colormap == "rgb":
             if moment.seen.colours is None:
                 raise SceneError("what.colormap=rgb: this method has no colours; give the name of a matplotlib map")
             return moment.seen.colours.numpy()
         low, high = self.range_c or moment.seen.limits
-        try:
-            colours = colorize(moment.values[:, None], low, high, self.colormap)
-        except (KeyError, ValueError) as error:
-            raise SceneError(f"what.colormap={self.colormap} is no map of matplotlib (and not rgb): {error}") from error
-        return colours[:, 0].astype(np.float32) / 255
+        return colorize(moment.values[:, None], low, high, self.colormap)[:, 0].astype(np.float32) / 255
 
     def opacities(self, moment: Moment) -> Tensor:
         """Opacities [N] that belong to these colours."""

@@ -15,7 +15,7 @@ from heatsplat.export.formats.base import Format, checked_range, optional
 from heatsplat.export.moment import Moment
 from heatsplat.geometry.coverage import DEPTH_TOLERANCE
 from heatsplat.geometry.looks import values_at
-from heatsplat.io.pictures import colorize
+from heatsplat.io.pictures import checked_colormap, colorize
 
 log = logging.getLogger("heatsplat")
 
@@ -53,7 +53,7 @@ class Mesh(Format):
         if views is not None:
             check_count("what.views", views)
         self.mesh, self.views, self.two_sided = Path(mesh).expanduser(), views, two_sided
-        self.colormap, self.range_c = colormap, checked_range(range_c)
+        self.colormap, self.range_c = checked_colormap("what.colormap", colormap), checked_range(range_c)
 
     def write(self, moment: Moment, path: Path) -> None:
         trimesh = optional("trimesh", "mesh")
