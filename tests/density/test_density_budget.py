@@ -183,7 +183,7 @@ def test_only_what_the_score_asks_for_is_gathered():
     gathered = {}
     for score in ("both", "error", "edge", "absgrad", "uniform"):
         policy = budget(start=0, stop=100, every=10, views=2, score=score, remove_at=())
-        names = set(policy.initial_state(1, torch.device("cpu"))) - {"shown", "seen"}
+        names = set(policy.initial_state(1, torch.device("cpu"))) - {"shown", "seen", "judged"}
         asked = [[policy.absgrad_at(step), policy.maps_at(step)] for step in (7, 9, 100)]
         assert asked[0] == asked[2] == [False, 0]
         gathered[score] = (names, *asked[1])
@@ -323,6 +323,29 @@ def test_what_a_pass_of_the_views_hardly_shows_leaves_after_it():
     assert cloud.splats.means[:, 0].tolist() == [0, 3, 15] and not cloud.state["shown"].any()
 
 
+def test_of_many_views_the_last_pass_that_ends_in_time_judges_and_what_was_split_in_it_stays():
+    def policy_of(views: int) -> Budget:
+        policy = budget(start=0, stop=0, every=10, remove_at=(96,), remove_by=180)
+        policy.steps_of_pass = views
+        return policy
+
+    def judged(views: int) -> list[int]:
+        return [step for step in range(200) if policy_of(views).maps_at(step)]
+
+    assert judged(40) == list(range(120, 160))  # the first that begins at the step or later
+    assert judged(70) == list(range(70, 140))  # that one would end at step 209
+    assert judged(95) == list(range(95)) and judged(190) == []
+
+    policy = policy_of(70)
+    cloud = make_cloud(policy, 4)
+    for step in range(70, 140):
+        observed(policy, cloud, torch.tensor([90.0, 90, 0, 0, 0])[: len(cloud), None], step)
+        if step == 100:
+            cloud.split(torch.tensor([3]), policy.split)  # views before this step may show its halves
+        change = refine(policy, cloud, step)
+    assert change.removed == 1 and cloud.splats.means[:2, 0].tolist() == [0, 3] and len(cloud) == 4
+
+
 def test_what_only_masked_pixels_show_leaves_and_does_not_count_as_right():
     policy = budget(start=0, stop=100, every=4, noise=0.01, remove_at=(4,))
     policy.prepare(noisy_scene(0.01, 4), "thermal")
@@ -349,6 +372,7 @@ def test_what_another_modality_shows_stays():
     cloud.splats.raw["opacity_logits"] = torch.nn.Parameter(torch.tensor([[0.0, 0.0], [-30.0, 0.0], [-30.0, -30.0]]))
     cloud.state["shown"] = torch.tensor([1.0, 0.0, 0.0])
     cloud.state["seen"] = torch.tensor([2.0, 0.0, 0.0])
+    cloud.state["judged"] += 1
     assert policy._worth(cloud).tolist() == [True, True, False]
 
 

@@ -27,6 +27,7 @@ SCORES = ("both", "error", "edge", "absgrad", "uniform")
 BLUR = 1.5  # pixels: standard deviation of the Gaussian under which edges are looked for; noise has weaker ones
 BY_CHANCE = 0.01  # of a Gaussian's pixels, noise alone lifts fewer above three of its standard deviations (0.27 %)
 OF_PIXELS = ("weight", "wrong", "worth")  # what maps over pixels are summed into, in their order
+FOR_REMOVAL = ("shown", "seen", "judged")  # pixels on which a Gaussian shows, views that show it, views that could have
 DIM = 0.01  # of all that a view shows, the Gaussians that contribute least and together no more than this are not seen in it
 
 
@@ -46,7 +47,8 @@ class Budget(DensityControl):
 
     Once they have come, Gaussians leave that the training views hardly show: after the first whole pass of the views that
     begins at a step of ``remove_at`` or later, those outside the share ``keep`` of all blending weights, and those seen in
-    fewer than two of several views. Nothing is added after ``stop``, and opacities are never reset.
+    fewer than two of several views. Where there are so many views that this pass would end after ``remove_by``, it is the last
+    pass that ends by then, and what was split in it stays. Nothing is added after ``stop``, and opacities are never reset.
 
     Blending weights are those on pixels that count: what only masked pixels show is shown by no view. With several modalities,
     errors are those of all images and blending weights those of the first; what another modality shows is never removed.
@@ -72,6 +74,7 @@ class Budget(DensityControl):
         least_pixels: Gaussians wrong on fewer pixels than this, over all views of the score, are not split.
         prune_opacity: Gaussians below this opacity (in every modality) are removed at events.
         remove_at: steps from which on a pass of the views tells which Gaussians they hardly show; those leave after it.
+        remove_by: last step of such a pass, so that the others can settle; shorter than a pass, none are removed so.
         keep: share of all blending weights that stays.
         split: how a Gaussian is split.
 
@@ -79,7 +82,7 @@ class Budget(DensityControl):
         ValueError: an option is out of its range.
     """
 
-    milestones, intervals = ("start", "stop", "remove_at"), ("every",)
+    milestones, intervals = ("start", "stop", "remove_at", "remove_by"), ("every",)
 
     def __init__(
         self,
@@ -98,6 +101,7 @@ class Budget(DensityControl):
         least_pixels: float = 3.0,
         prune_opacity: float = 0.005,
         remove_at: Sequence[int] = (14_400,),
+        remove_by: int = 27_000,
         keep: float = 0.999,
         split: LongAxisSplit | None = None,
     ) -> None:
@@ -119,10 +123,10 @@ class Budget(DensityControl):
                 "density.keep lies in (0, 1], and floor, noise and least_pixels are not negative, "
                 f"got {keep}, {floor}, {noise} and {least_pixels}"
             )
-        if min(start, stop, prune_opacity, *remove_at) < 0:
+        if min(start, stop, prune_opacity, remove_by, *remove_at) < 0:
             raise ValueError(
-                "density.start, stop, prune_opacity and remove_at must not be negative, "
-                f"got {start}, {stop}, {prune_opacity} and {list(remove_at)}"
+                "density.start, stop, prune_opacity, remove_at and remove_by must not be negative, "
+                f"got {start}, {stop}, {prune_opacity}, {list(remove_at)} and {remove_by}"
             )
         self.start, self.stop, self.every, self.cap_max = start, stop, every, cap_max
         self.multiple, self.least = multiple, least
@@ -130,7 +134,8 @@ class Budget(DensityControl):
         self.sampled = sampled or score == "uniform"
         self._of_pixels, self._of_pull = score in ("both", "error", "edge"), score in ("both", "absgrad")
         self.floor, self.noise, self.least_pixels = floor, noise, least_pixels
-        self.prune_opacity, self.remove_at, self.keep = prune_opacity, tuple(remove_at), keep
+        self.prune_opacity, self.keep = prune_opacity, keep
+        self.remove_at, self.remove_by = tuple(remove_at), remove_by
         self.split = split or LongAxisSplit()
         self.steps_of_pass = 1
 
@@ -150,8 +155,8 @@ class Budget(DensityControl):
 
     def initial_state(self, count: int, device: torch.device) -> dict[str, Tensor]:
         """What was summed since the last event, each [count]: for growth, as far as the score asks, "pull", "weight" and "wrong"
-        (pixels) and "worth" (errors or edges); "shown" (pixels) and "seen" (views) for removal. Pixels are those that count."""
-        return {name: torch.zeros(count, device=device) for name in (*self._summed, "shown", "seen")}
+        (pixels) and "worth" (errors or edges); FOR_REMOVAL for removal. Pixels are those that count."""
+        return {name: torch.zeros(count, device=device) for name in (*self._summed, *FOR_REMOVAL)}
 
     @property
     def _summed(self) -> tuple[str, ...]:
@@ -180,7 +185,8 @@ class Budget(DensityControl):
     def _removal_in(self, step: int) -> int | None:
         """Steps from here to the next removal, 0 where it is now; None after the last one."""
         views = self.steps_of_pass
-        ends = [(-(-begin // views) + 1) * views - 1 for begin in self.remove_at]
+        last = (self.remove_by + 1) // views * views - 1
+        ends = [min((-(-begin // views) + 1) * views - 1, last) for begin in self.remove_at]
         return min((end - step for end in ends if end >= step), default=None)
 
     def _scores(self, step: int) -> bool:
@@ -223,6 +229,7 @@ class Budget(DensityControl):
             weight = sums[:, 0]
             state["shown"].index_add_(0, ids, weight)
             state["seen"].index_add_(0, ids, _outside(weight, DIM).logical_not().to(weight))
+            state["judged"] += 1
 
     # What is done ----------------------------------------------------------------------------------------------------
 
@@ -235,7 +242,7 @@ class Budget(DensityControl):
         if growth:
             removed += self._prune(cloud, self._visible(cloud), step)
             added = self._grow(cloud, step, generator)
-        for due, names in ((growth, self._summed), (removal, ("shown", "seen"))):
+        for due, names in ((growth, self._summed), (removal, FOR_REMOVAL)):
             for name in names if due else ():
                 cloud.state[name].zero_()
         return DensityChange(added, removed) if growth or removal else None
@@ -245,10 +252,12 @@ class Budget(DensityControl):
         return opaque & torch.isfinite(cloud.splats.means).all(dim=1)
 
     def _worth(self, cloud: Cloud) -> Tensor:
-        """Which Gaussians [N] the training views show, by what was summed over a pass of them."""
+        """Which Gaussians [N] the training views show, by what was summed over a pass of them, or may show: those of which
+        a part of the pass tells nothing, since they were split in it or the plan was moved."""
         seen = cloud.state["seen"] >= min(2, self.steps_of_pass)
         elsewhere = (cloud.splats.opacities[1:] > self.prune_opacity).any(dim=0)
-        return ~_outside(cloud.state["shown"], 1 - self.keep) & seen | elsewhere
+        unknown = cloud.state["judged"] < self.steps_of_pass
+        return ~_outside(cloud.state["shown"], 1 - self.keep) & seen | elsewhere | unknown
 
     def _prune(self, cloud: Cloud, mask: Tensor, step: int) -> int:
         return cloud.prune(
