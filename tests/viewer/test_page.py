@@ -364,6 +364,50 @@ def test_spots_of_what_was_learned_are_those_of_the_whole_picture(page):
     assert found[0] == found[1] and found[0][1] == "time constant"
 
 
+def test_an_isotherm_paints_what_lies_in_it_and_tells_how_much(page):
+    wait_until(page, "!viewer.sorter.busy && !viewer.stale.order && !viewer.pending")
+    page.execute_script("viewer.isotherm.choose('above'); viewer.areas.tool = 'box'; viewer.areas.addInMiddle()")
+    wait_until(page, "document.getElementById('isothermNote').textContent")
+    low, high = page.execute_script("return viewer.range")
+    assert page.execute_script("return viewer.isotherm.ends[0]") == pytest.approx(low + 0.75 * (high - low))
+    painted = """viewer.frame(performance.now());
+      const shown = document.getElementById('canvas'), page = viewer.picturePage().getContext('2d');
+      const bytes = page.getImageData(0, 0, shown.width, shown.height).data, wanted = MARKED.map((part) => 255 * part);
+      let count = 0, known = 0;
+      for (let j = 0; j < bytes.length; j += 4) count += wanted.every((part, i) => Math.abs(bytes[j + i] - part) < 4);
+      return [count / viewer.sampled().length, viewer.isotherm.share(viewer.sampled())];"""
+    values = np.array(page.execute_script("return viewer.sampled()"))
+    for how, shares in (("above", (0.7, 1)), ("between", (0.3, 0.6)), ("below", (0, 0.4))):
+        ends = np.quantile(values, shares) + np.array([-1, 1]) * (np.array(shares) == [0, 1])  # nothing lies beyond
+        page.execute_script(
+            "viewer.isotherm.choose(arguments[0]); viewer.isotherm.shown.ends = arguments[1]", how, ends.tolist()
+        )
+        seen, told = page.execute_script(painted)
+        assert told == pytest.approx(((values >= ends[0]) & (values <= ends[1])).mean())
+        assert told == pytest.approx(shares[1] - shares[0], abs=0.02) and seen == pytest.approx(told, abs=0.02), how
+    page.execute_script("viewer.isotherm.shown.ends = [-Infinity, viewer.isotherm.ends[1]]")
+    words = page.execute_script("viewer.isotherm.draw(); return viewer.isotherm.words")
+    assert words == f"below {ends[1]:.4g} °C"
+    header, row = page.execute_script("return viewer.areas.table()").strip().split("\n")
+    assert header.endswith(f'"{words} (%)"') and 0 <= float(row.split(",")[-1]) <= 100
+    field = page.find_element("id", "isothermHigh")
+    field.send_keys(*ALL, "30", "\ue007")
+    wait_until(page, "viewer.isotherm.ends[1] === 30")
+    before = page.execute_script("viewer.isotherm.choose('between'); return viewer.isotherm.ends")
+    assert before[0] == 30
+    field.send_keys(*ALL, "-300", "\ue007")
+    wait_until(page, "document.getElementById('message').textContent.includes('below the upper')")
+    assert page.execute_script("return viewer.isotherm.ends") == before
+    page.execute_script("document.activeElement.blur()")
+    keys(page, "i")
+    wait_until(page, "viewer.isotherm.shown.how === 'none' && document.getElementById('isothermEnds').hidden")
+    assert page.execute_script(painted)[0] == 0
+    page.execute_script("viewer.choose({quantity: 'learned time_constant_s'}); viewer.isotherm.choose('below')")
+    assert page.execute_script("return viewer.isotherm.words").startswith("below ")
+    page.execute_script("viewer.choose({quantity: 'camera'})")
+    assert page.execute_script("return viewer.isotherm.shown.how") == "none"  # each kind of value has its own
+
+
 def test_curves_and_the_picture_can_be_kept(page):
     page.execute_script("viewer.probes.list = []; viewer.goTo(0); viewer.probes.pin(...viewer.middle())")
     head, *rows = page.execute_script("return viewer.probes.table()").strip().split("\n")

@@ -19,8 +19,8 @@ FILE = "viewer.html"
 CAMERAS = 36  # in a page: their images take 1 to 2 MB
 SOURCES = Path(__file__).resolve().parent / "page"
 SCRIPTS = (
-    "payload.js", "camera.js", "splats.js", "sorting.js", "drawing.js", "chart.js", "probes.js", "areas.js", "compare.js",
-    "controls.js", "viewer.js",
+    "payload.js", "camera.js", "splats.js", "sorting.js", "drawing.js", "isotherm.js", "chart.js", "probes.js",
+    "areas.js", "compare.js", "controls.js", "viewer.js",
 )  # fmt: skip
 
 

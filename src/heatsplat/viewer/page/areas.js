@@ -109,6 +109,8 @@ class Areas {
       return { x, y, along, value: content[j + 3] > SURFACE ? viewer.valueOf(content, j, x, y, ofRun) : null };
     });
     area.found = summary(values, step * step);
+    const { isotherm } = viewer, log = viewer.attribute?.log;
+    if (area.found) area.found.marked = isotherm.ends && isotherm.share(values.flatMap(({ value }) => value === null ? [] : [log ? Math.log10(value) : value]));
     if (area.kind === "line") area.profile = values;
   }
 
@@ -124,7 +126,8 @@ class Areas {
     this.measureAll(false);
     const rows = this.list.map(({ name, found }) => [["name", name], ["values", quoted(viewer.shownName)], ...when,
       [`min${unit}`, found && values(found.cold.value)], [`mean${unit}`, found && values(found.mean)], [`max${unit}`, found && values(found.hot.value)],
-      [`standard deviation${unit}`, found && values(found.deviation)], ["pixels", found ? found.count : 0]]);
+      [`standard deviation${unit}`, found && values(found.deviation)], ["pixels", found ? found.count : 0],
+      ...viewer.isotherm.ends ? [[quoted(`${viewer.isotherm.words} (%)`), found && (100 * found.marked).toFixed(2)]] : []]);
     return [rows[0].map(([name]) => name), ...rows.map((row) => row.map(([, cell]) => cell ?? ""))].map((row) => row.join()).join("\n") + "\n";
   }
 
@@ -152,7 +155,7 @@ class Areas {
     item.className = area.kind;
     if (found) {
       item.append(Object.assign(document.createElement("small"), { textContent: `min ${viewer.words(found.cold.value)} · max ${viewer.words(found.hot.value)} · `
-        + `σ ${viewer.amount(found.deviation)} · ${found.count.toLocaleString("en")} pixels` }));
+        + `σ ${viewer.amount(found.deviation)} · ${found.count.toLocaleString("en")} pixels${found.marked === null ? "" : ` · ${percent(found.marked)} ${viewer.isotherm.words}`}` }));
     }
     return item;
   }

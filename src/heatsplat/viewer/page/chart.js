@@ -71,8 +71,8 @@ function drawCurves(svg, times, curves, now, unit, record, axis = timeAxis(times
   if (now !== null) node("line", { class: "now", x1: x(now), x2: x(now), y1: top, y2: bottom }, svg);
 }
 
-// Counts of values over [low, high], painted with a colour map; marks at the ends of the range of colours.
-function drawHistogram(canvas, counts, low, high, range, colours) {
+// Counts of values over [low, high], painted with a colour map; marks at the ends of the range of colours. isotherm: as the picture has it.
+function drawHistogram(canvas, counts, low, high, range, colours, isotherm) {
   const width = canvas.width = canvas.clientWidth * devicePixelRatio || 1;
   const height = canvas.height = canvas.clientHeight * devicePixelRatio || 1;
   const context = canvas.getContext("2d"), most = Math.max(...counts, 1);
@@ -81,7 +81,8 @@ function drawHistogram(canvas, counts, low, high, range, colours) {
     const value = low + (x + 0.5) / width * (high - low);
     const share = Math.min(Math.max((value - range[0]) / Math.max(range[1] - range[0], 1e-9), 0), 1);
     const j = 3 * Math.round(share * 255);
-    context.fillStyle = `rgb(${colours[j]} ${colours[j + 1]} ${colours[j + 2]})`;
+    const colour = isotherm.holds(value) ? MARKED.map((part) => 255 * part) : colours.subarray(j, j + 3);
+    context.fillStyle = `rgb(${colour.join(" ")})`;
     const tall = Math.sqrt(counts[Math.min(Math.floor(x / width * counts.length), counts.length - 1)] / most) * (height - bar - 2);
     context.fillRect(x, height - bar, 1, bar);
     context.globalAlpha = value < range[0] || value > range[1] ? 0.35 : 0.85;

@@ -123,6 +123,8 @@ class Controls {
       viewer.fit();
     };
     $("low").onchange = $("high").onchange = () => this.typedEnds();
+    $("isotherm").onchange = () => viewer.isotherm.choose($("isotherm").value);
+    $("isothermLow").onchange = $("isothermHigh").onchange = () => viewer.isotherm.typed();
   }
 
   typedEnds() {
@@ -187,7 +189,7 @@ class Controls {
       "[": () => viewer.choose({ split: Math.max(viewer.state.split - 0.04, 0.02) }),
       "]": () => viewer.choose({ split: Math.min(viewer.state.split + 0.04, 0.98) }),
       c: () => viewer.cycle("map", "map"), r: () => viewer.fit(),
-      x: () => viewer.choose({ spots: !viewer.state.spots }),
+      i: () => viewer.isotherm.next(), x: () => viewer.choose({ spots: !viewer.state.spots }),
       o: () => {
         viewer.choose({ walk: !viewer.state.walk });
         viewer.say(viewer.state.walk ? "walk" : "orbit");

@@ -79,7 +79,8 @@ uniform vec2 range, spread, limits, limitsOfRun, learned, background;  // backgr
 uniform vec3 paper;
 uniform vec4 frame;          // left, top, width, height of the camera's image on the canvas
 uniform int kind, other;     // kind: 0 temperature, 1 attribute, 2 visible light; other: see below
-uniform bool difference, clampFirst, clampSecond, addPicture;
+uniform vec2 isotherm;       // ends between which values have one colour
+uniform bool difference, clampFirst, clampSecond, addPicture, marked;
 uniform float split, height;
 out vec4 shown;
 
@@ -95,6 +96,7 @@ float decoded(sampler2D entries, float share) {
 vec4 paint(sampler2D colours, float value, vec2 ends, float alpha) {
   float share = clamp((value - ends.x) / max(ends.y - ends.x, 1e-9), 0.0, 1.0);
   vec3 colour = texture(colours, vec2((share * 255.0 + 0.5) / 256.0, 0.5)).rgb;
+  if (marked && value >= isotherm.x && value <= isotherm.y) colour = vec3(MARKED);
   return vec4(mix(paper, colour, smoothstep(0.005, 0.05, alpha)), 1.0);
 }
 
@@ -172,7 +174,7 @@ class Drawing {
     [this.exact, this.quicker] = [kinds[0], kinds[0].type === gl.FLOAT ? kinds[1] : kinds[0]];
     this.quick = false;
     this.splatting = this.program(SPLAT_VERTEX.replaceAll("WIDTH", WIDTH), SPLAT_FRAGMENT);
-    this.showing = this.program(SHOW_VERTEX, SHOW_FRAGMENT.replaceAll("MOSTLY", MOSTLY));
+    this.showing = this.program(SHOW_VERTEX, SHOW_FRAGMENT.replaceAll("MOSTLY", MOSTLY).replaceAll("MARKED", MARKED.join()));
     this.empty = gl.createVertexArray();
     this.targets = {};
     this.blank = this.texture(gl.RGBA8, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));

@@ -25,9 +25,10 @@ class Viewer {
       added: entry.added ? entry.added.map((part) => ({ name: part.name, values: inUnits(part, array) })) : null }));
     this.off = new Set();  // parts of the camera's model that are switched off
     this.state = { quantity: "camera", other: "nothing", how: "swipe", split: 0.5, map: "inferno", walk: false, playing: false, spots: false, at: 0,
-      time: this.told.record ? (this.told.record[0] + this.told.record[1]) / 2 : 0, otherTime: this.told.record ? this.told.record[0] : 0, ranges: {} };
+      time: this.told.record ? (this.told.record[0] + this.told.record[1]) / 2 : 0, otherTime: this.told.record ? this.told.record[0] : 0, ranges: {}, isotherms: {} };
     this.probes = new Probes(this);
     this.areas = new Areas(this);
+    this.isotherm = new Isotherm(this);
     this.camera = this.cameras[0].camera;
     this.target = this.told.centre;
     this.quality = 1;
@@ -367,11 +368,13 @@ class Viewer {
         kind: state.quantity === "visible" ? 2 : attribute ? 1 : 0,
         other: same ? 1 : kinds[other],
         difference: this.differing,
+        marked: this.isotherm.ends !== null,
         clampFirst: state.quantity === "camera",
         clampSecond: other === "camera" || (other === "time" && state.quantity === "camera") || (other === "run" && this.run?.clamped),
       },
       floats: {
         range: this.differing ? [0, 1] : this.range,
+        isotherm: (this.isotherm.ends || [0, 0]).map((end) => Math.min(Math.max(end, -3e38), 3e38)),
         spread: this.differing ? this.range : [-1, 1],
         limits: told.limits,
         limitsOfRun: this.run ? this.run.told.limits : told.limits,
@@ -495,7 +498,8 @@ class Viewer {
     }
     if (this.state.spots) this.spots = this.extremes();
     this.drawMarks();
-    drawHistogram($("histogram"), counts, low - pad, high + pad, this.range, this.maps[this.mapName].colours);
+    drawHistogram($("histogram"), counts, low - pad, high + pad, this.range, this.maps[this.mapName].colours, this.isotherm);
+    this.isotherm.count(values);
     this.settled = true;
   }
 
@@ -642,7 +646,8 @@ class Viewer {
     $("barHigh").textContent = `≥ ${digits(this.range[1])}`;
     $("barName").textContent = (this.differing ? `minus ${$("other").selectedOptions[0].text}` : this.quantityName)
       + (this.unit ? `, ${this.unit}` : "") + (this.attribute?.log ? " (log)" : "");
-    drawHistogram($("bar"), [0], this.range[0], this.range[1], this.range, this.maps[this.mapName].colours);
+    drawHistogram($("bar"), [0], this.range[0], this.range[1], this.range, this.maps[this.mapName].colours, this.isotherm);
+    this.isotherm.draw();
     this.drawMarks();
     this.areas.draw();
     this.probes.draw();
