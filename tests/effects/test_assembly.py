@@ -274,8 +274,19 @@ def test_an_effect_that_costs_more_than_it_brings_is_left_out_when_that_is_asked
     assert of[0.0] == of[0.2] == known
     assert {name for name, one in of[0.5].items() if one.on} == {"agc"}  # conduction stands on relaxation
     assert "1.0 dB for 4.00 ms a step" in of[0.5]["relaxation"].reason
+    assert of[0.5]["conduction"].reason == "it stands on relaxation, which is off"
+    assert of[0.5]["solar"] == known["solar"]  # stands on it too, and was off anyhow
     lost = {name: replace(one, gain_db=-0.2) for name, one in known.items()}  # on, though images cannot tell
     assert assembly.affordable(lost, prices, 0.0) == lost
+
+
+def test_what_was_asked_for_keeps_what_it_stands_on_whatever_that_costs():
+    known = verdicts("relaxation", "conduction", "agc")
+    known |= {name: replace(known[name], gain_db=1.0) for name in ("relaxation", "agc")}
+    prices = {"relaxation": Price(2, 0, 4.0), "conduction": Price(0, 1, 0.1), "agc": Price(0, 9, 4.0)}
+    found = assembly.affordable(known, prices, 0.5, {"conduction": "on", "agc": "auto"})
+    assert names_on(found) == {"relaxation", "conduction"}
+    assert names_on(assembly.affordable(known, prices, 0.5, {"conduction": "auto"})) == set()
 
 
 # Choices ---------------------------------------------------------------------------------------------------

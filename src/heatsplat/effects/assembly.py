@@ -151,19 +151,29 @@ def without(verdicts: Mapping[str, Verdict], name: str) -> dict[str, Verdict]:
 
 
 def affordable(
-    verdicts: Mapping[str, Verdict], prices: Mapping[str, Any], least_db_per_ms: float
+    verdicts: Mapping[str, Verdict],
+    prices: Mapping[str, Any],
+    least_db_per_ms: float,
+    given: Mapping[str, str] | None = None,
 ) -> dict[str, Verdict]:
     """The verdicts without the effects that gain less on held-out observations than so many decibels per millisecond that a
-    step of training takes longer; 0 keeps all."""
+    step of training takes longer, and without those that stand on them; 0 keeps all, and what was asked for (``given``, of
+    ``explicit_choices``) stays with what it stands on."""
     found = dict(verdicts)
     if least_db_per_ms == 0:  # where images cannot tell, what was left out may gain less than nothing
         return found
+    asked = {name for name, choice in (given or {}).items() if choice == "on"}
     for name in _on(verdicts):
         gain, price = verdicts[name].gain_db, prices.get(name)
         if gain is None or price is None or gain >= least_db_per_ms * price.ms_per_step or not found[name].on:
             continue
+        gone = [other for other in dependents(name) if found[other].on]
+        if asked.intersection(gone):
+            continue
         why = f"{gain:.1f} dB for {price.ms_per_step:.2f} ms a step are less than effects.least_db_per_ms={least_db_per_ms:g}"
         found = without(found, name)
+        for other in gone:
+            found[other] = replace(found[other], reason=f"it stands on {name}, which is off")
         found[name] = replace(found[name], reason=why)
     return found
 

@@ -43,7 +43,8 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
             config["max_steps"],
             device_of(config["trainer"]["accelerator"], config["renderer"]),
         )
-        verdicts = assembly.affordable(verdicts, costs, config["effects"]["least_db_per_ms"])
+        given = assembly.explicit_choices(config["effects"])
+        verdicts = assembly.affordable(verdicts, costs, config["effects"]["least_db_per_ms"], given)
     found = assembly.verdicts_as_dicts(verdicts, costs)
     for line in assembly.verdict_table(found):
         log.info("%s", line)
