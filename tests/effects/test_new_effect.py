@@ -72,7 +72,7 @@ def test_a_file_adds_an_effect(tilt):
 class SimpleLook:
     blind = False
 
-    class scene:
+    class given:
         metadata = frozenset()
 
 

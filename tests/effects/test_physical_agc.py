@@ -14,7 +14,7 @@ def test_gains_that_cannot_be_told_are_left_out_beside_recorded_weather(told, we
     monkeypatch.setattr(agc, "outdone", lambda *_: False)
     monkeypatch.setattr(agc, "gained", lambda *_: Evidence(100.0, "gains change values", told=told, gain_db=9.0))
     inspected = SimpleNamespace(
-        weathered=object() if weathered else None, scene=SimpleNamespace(metadata=frozenset({"images"})), blind=False
+        weathered=object() if weathered else None, given=SimpleNamespace(metadata=frozenset({"images"})), blind=False
     )
     verdict = catalogue._verdict(agc.EFFECT, inspected, "auto")
     assert verdict.on == on and verdict.told == told

@@ -12,7 +12,7 @@ from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
 from heatsplat.effects import swept_points as module
 from heatsplat.effects.base import Verdict
-from heatsplat.effects.catalogue import decide
+from heatsplat.effects.catalogue import CATALOGUE, decide
 from heatsplat.effects.swept_points import swept_points, with_swept_points
 
 
@@ -47,6 +47,15 @@ def test_a_view_of_which_little_counts_takes_no_point_away(cooling, swept):
     train = cooling.train
     masked = ViewSet(train.frames, lambda i: replace(train[i], mask=few) if i == 0 else train[i])
     assert len(swept_points(replace(cooling, train=masked))) > 0.7 * len(swept)
+
+
+def test_images_are_not_swept_where_nothing_is_asked_of_them(cooling, monkeypatch):
+    def swept(scene):
+        raise AssertionError("a sweep takes longer than most else before training")
+
+    monkeypatch.setattr(module, "swept_points", swept)
+    verdicts = decide(cooling, {effect.name: "off" for effect in CATALOGUE if effect.name != "pixel_area"})
+    assert not any(verdict.on for verdict in verdicts.values())
 
 
 def test_pixels_that_no_block_of_the_smaller_images_holds_move_no_point(monkeypatch):

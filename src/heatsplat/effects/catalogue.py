@@ -52,13 +52,13 @@ def decide(scene: SceneData, choices: Mapping[str, str] = {}) -> dict[str, Verdi
 
 
 def _verdict(effect: Effect, inspected: Inspection, choice: str) -> Verdict:
-    missing = sorted(effect.needs - inspected.scene.metadata)
+    missing = sorted(effect.needs - inspected.given.metadata)
     if missing and choice != "off":
         return Verdict(effect.name, False, None, None, f"the scene lacks {', '.join(missing)}, which it needs")
     if choice == "off":
         return Verdict(effect.name, False, None, None, f"effects.{effect.name}=off")
     evidence = effect.evidence(inspected)
-    if inspected.blind and evidence.statistic is None and evidence.reason == inspected.obs.why:
+    if evidence.statistic is None and inspected.blind and evidence.reason == inspected.obs.why:
         evidence = replace(evidence, told=False)
     if choice == "on":
         return Verdict(effect.name, True, None, None, f"effects.{effect.name}=on", evidence.settings)

@@ -24,19 +24,22 @@ class Inspection:
     """A scene, for the evidence of effects.
 
     Args:
-        scene: seen through its training views only; of the others count the sizes. In ``scene``, random points give way to
-            those that its images show (``swept_points``); ``given`` is the scene as training has it.
+        scene: seen through its training views only; of the others count the sizes. ``given`` is it, as training has it.
         effects: those that the joint fit may take in.
     """
 
     def __init__(self, scene: SceneData, effects: Sequence[Effect] = ()) -> None:
-        self.given, self.scene = scene, with_swept_points(scene)
-        self.effects = effects
+        self.given, self.effects = scene, effects
+
+    @cached_property
+    def scene(self) -> SceneData:
+        """The scene, in which random points give way to those that its images show (``swept_points``)."""
+        return with_swept_points(self.given)
 
     @property
     def blind(self) -> bool:
         """Whether the scene's points were random and its images show no others."""
-        return "points_random" in self.scene.notes and len(self.scene.points) == 0
+        return "points_random" in self.given.notes and len(self.scene.points) == 0
 
     @cached_property
     def obs(self) -> Observations:

@@ -24,7 +24,7 @@ def fineness(scene: SceneData) -> int | None:
 
 def evidence(inspected: Inspection) -> Evidence:
     """Whether finer images are asked for than were recorded. Sizes of images say it, not what they show."""
-    factor = fineness(inspected.scene)
+    factor = fineness(inspected.given)
     if factor is None:
         return Evidence(None, "training views and those that are asked for have no whole number between their sizes")
     if factor == 1:
