@@ -21,7 +21,8 @@ def may_be_heat(fit: Fit, model: Model, name: str) -> bool:
     heat = _heat(fit, model, name)
     if heat is None:
         return False
-    beyond, free = _beyond(_course(fit, model, name), heat)
+    seen = _seen(fit)
+    beyond, free = _beyond(_course(fit, model, name)[:, seen], heat[seen])
     return free <= 0 or float(beyond) < 1.0 - LIKE_HEAT
 
 
@@ -33,11 +34,15 @@ def is_heat(fit: Fit, model: Model, name: str) -> bool:
     heat = _heat(fit, model, name)
     if heat is None or fit.data.drivers is not None:
         return False
-    beyond, free = _beyond(_course(fit, model, name), heat)
+    seen = _seen(fit)
+    beyond, free = _beyond(_course(fit, model, name)[:, seen], heat[seen])
     if free < FREE:
         return False
     steps = torch.randn(WALKS, fit.data.frames, generator=generator_for(0, 0, "walks"), dtype=torch.float64)
-    walks, _ = _beyond(steps.cumsum(1), heat)
+    in_time = fit.data.times_s.argsort(stable=True)
+    walks = torch.empty_like(steps)
+    walks[:, in_time] = steps.cumsum(1)
+    walks, _ = _beyond(walks[:, seen], heat[seen])
     return float((walks <= beyond).double().mean()) < BY_CHANCE
 
 
@@ -54,9 +59,15 @@ def _heat(fit: Fit, model: Model, name: str) -> Tensor | None:
     return torch.cat([ones, *(fit.basis(one, 1) for one in known)], 1)
 
 
+def _seen(fit: Fit) -> Tensor:
+    """Which images [F] say anything of what they have in common."""
+    return (fit.weights > 0).any(0)
+
+
 def _course(fit: Fit, model: Model, name: str) -> Tensor:
-    """The course over time [1, F] of what an effect adds to the points."""
-    added = fit.contributions(model)[name] * (fit.weights > 0)
+    """The course over time [1, F] of what an effect adds to the points, or would add to those that an image does not see: how
+    many an image sees is no change of it."""
+    added = fit.contributions(model)[name][(fit.weights > 0).any(1)]
     return torch.linalg.svd(added, full_matrices=False).Vh[:1]
 
 
