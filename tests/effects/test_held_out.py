@@ -5,7 +5,7 @@ import torch
 from effects.tracks import COOLING, DRIFTING, FRAMES, NOTHING, fit_to, levels
 
 from heatsplat.effects.joint.certainty import MIN_SIGMAS
-from heatsplat.effects.joint.held_out import FOLDS, compared, fold_of, shuffled, squares_of
+from heatsplat.effects.joint.held_out import FOLDS, HeldOut, compared, fold_of, shuffled, squares_of, would_tell
 from heatsplat.effects.joint.model import Model
 
 
@@ -29,6 +29,13 @@ def test_what_is_there_gains_where_it_was_not_fitted_and_what_is_not_there_loses
     still = fit_to(levels())
     gain = compared(squares_of(still, model), squares_of(still, NOTHING), still.weights)
     assert gain.db < 0
+
+
+def test_frames_are_asked_for_only_where_they_would_be_looked_at():
+    """Twice the standard errors take four times the frames; of a recording of any length 64 are looked at."""
+    assert would_tell(HeldOut(1.0, 2.0, 15), 4.0, 0.5) == "about 60 frames would tell"
+    for gain in (HeldOut(1.0, 2.0, 17), HeldOut(1.0, 2.0, 64), HeldOut(1.0, -3.0, 5)):
+        assert would_tell(gain, 4.0, 0.5) == "less noise would tell, for no more than 64 frames are looked at"
 
 
 @pytest.mark.parametrize("together", [True, False])

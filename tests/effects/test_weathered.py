@@ -190,4 +190,4 @@ def test_a_certain_gain_that_is_too_small_does_not_ask_for_more_frames():
     for gain, large in ((HeldOut(2.5, 5.0, 48), False), (HeldOut(0.1, 5.0, 48), True)):
         evidence = weighed(gain, "found", large)
         assert not evidence.told and "too small" in evidence.reason and "frames" not in evidence.reason
-    assert "from 48 frames, about 108 would tell" in weighed(HeldOut(2.5, 2.0, 48), "found").reason
+    assert "from 36 frames, about 57 frames would tell" in weighed(HeldOut(2.5, 2.4, 36), "found").reason

@@ -14,7 +14,7 @@ from torch import Tensor
 from heatsplat.contracts import Weather
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Evidence
-from heatsplat.effects.joint.held_out import FOLDS, WORST, HeldOut, compared, fold_of
+from heatsplat.effects.joint.held_out import FOLDS, WORST, HeldOut, compared, fold_of, would_tell
 from heatsplat.effects.observations import Tracks
 from heatsplat.geometry.exposure import lit_beside, sky_directions, sun_directions
 from heatsplat.geometry.rotations import reflected
@@ -132,7 +132,7 @@ def weighed(
         found: says that.
         large: whether the effect is large enough to be one.
         can_be_none: whether no gain says that there is none.
-        needed: frames that would tell; else their number, from how the gain scatters.
+        needed: frames that would tell; else their number, from how the gain scatters (``would_tell``).
         least_db, nothing_db: decibels that are a gain, and that are none.
         sigmas: standard errors from which a gain is no chance.
     """
@@ -143,8 +143,8 @@ def weighed(
     if gain.sigmas > sigmas and not needed:  # more frames make it more certain, but no larger
         why = "cannot be told from what balances leave unexplained, for it is too small"
     else:
-        needed = needed or f"about {math.ceil(gain.images * (sigmas / max(gain.sigmas, CHANCE)) ** 2)}"
-        why = f"cannot be told from {gain.images} frames, {needed} would tell"
+        more_frames = f"{needed} would tell" if needed else would_tell(gain, sigmas, CHANCE)
+        why = f"cannot be told from {gain.images} frames, {more_frames}"
     return Evidence(gain.sigmas, f"{found}: {why}", told=False, gain_db=gain.db)
 
 

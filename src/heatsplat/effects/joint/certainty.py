@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +12,7 @@ from heatsplat.effects.joint.courses import ANY, common_courses
 from heatsplat.effects.joint.data import MIN_FREE
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.foreseen import holds_still
-from heatsplat.effects.joint.held_out import HeldOut, compared, shows, shuffled, squares_of
+from heatsplat.effects.joint.held_out import HeldOut, compared, shows, shuffled, squares_of, would_tell
 from heatsplat.effects.joint.least_squares import own_part
 from heatsplat.effects.joint.like_heat import may_be_heat
 from heatsplat.effects.joint.model import Model
@@ -23,6 +22,7 @@ from heatsplat.training.rng import generator_for
 
 # What an effect must bring on held-out observations: less is no loss, and within the scatter of the images it is chance.
 MIN_DB, MIN_SIGMAS = 0.3, 3.5
+CHANCE = 0.5  # standard errors that a gain counts at least where it is said how many frames would tell
 SHUFFLES, NO_CHANCE = 8, 30.0  # gains from which it is not asked whether chance makes as much
 # Nine tenths of the points in the most even third are explained to within so many times the expected error: nothing is left
 # for another effect. At edges poses err.
@@ -255,8 +255,8 @@ class Certainty:
             if not rule(fit, more, less):
                 return why
         if held_out.sigmas < MIN_SIGMAS and held_out.db > 0:
-            needed = math.ceil(held_out.images * (MIN_SIGMAS / max(held_out.sigmas, 0.5)) ** 2)
-            return f"what it gains scatters over the images as much as chance would; about {needed} frames would tell"
+            more_frames = would_tell(held_out, MIN_SIGMAS, CHANCE)
+            return f"what it gains scatters over the images as much as chance would; {more_frames}"
         if held_out.db < MIN_DB:
             return f"{held_out.db:.1f} dB on what was left out are no gain; more frames, or less noise, would tell"
         gain = fit.gain(more, less)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.model import Model
+from heatsplat.effects.observations import MAX_FRAMES
 
 # Each fold leaves out a quarter: of every image one half of the points, together with the other half of the image after next.
 FOLDS = 4
@@ -61,6 +62,19 @@ def compared(more: Tensor, less: Tensor, weights: Tensor) -> HeldOut:
 def shows(gain: HeldOut) -> bool:
     """Whether what is gained on held-out observations may be more than nothing."""
     return gain.db > NOTHING_DB and gain.sigmas > NOTHING_SIGMAS
+
+
+def would_tell(gain: HeldOut, sigmas: float, chance: float) -> str:
+    """Frames from which a gain that scatters as it does would be so many standard errors, in words; of a longer record no more
+    than MAX_FRAMES are looked at.
+
+    Args:
+        chance: standard errors that the gain counts at least.
+    """
+    needed = math.ceil(gain.images * (sigmas / max(gain.sigmas, chance)) ** 2)
+    if needed > MAX_FRAMES:
+        return f"less noise would tell, for no more than {MAX_FRAMES} frames are looked at"
+    return f"about {needed} frames would tell"
 
 
 def shuffled(fit: Fit, less: Model, generator: torch.Generator, together: bool) -> Fit:
