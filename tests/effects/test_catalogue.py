@@ -5,9 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, View, ViewSet
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, View, ViewSet, Weather
+from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.effects.base import STAGES
 from heatsplat.effects.catalogue import CATALOGUE, decide
+from heatsplat.effects.weather_record import drivers, drives
 
 NAMES = (
     "relaxation", "harmonic_source", "semi_infinite", "solar", "radiation", "convection", "conduction", "shadows",
@@ -94,3 +96,16 @@ def test_no_verdict_looks_at_images_that_are_held_out():
     scene = scene_of(noise(8), [10.0 * i for i in range(8)], points=50, thermal_range=ThermalRange(0.0, 10.0))
     dark, bright = scene_of(torch.zeros(3, 24, 32)).train, scene_of(torch.ones(3, 24, 32)).train
     assert decide(replace(scene, test=dark, val=bright)) == decide(replace(scene, test=bright, val=dark))
+
+
+def test_a_record_of_wind_and_rain_alone_hides_no_cooling():
+    """Nothing follows these over time: a scene under them relaxes as it does without a record, and no source drives it."""
+    cooling = Synthetic(scene="cooling", size="tiny").scene
+    times_s = torch.linspace(*cooling.record, 30, dtype=torch.float64)
+    ones = torch.ones_like(times_s)
+    windy = Weather(times_s, wind_m_s=2.0 * ones, rain_mm_h=0.1 * ones, humidity_percent=50.0 * ones)
+    assert not drives(windy) and drives(replace(windy, air_c=ones)) and not drives(None)
+    assert drivers(windy, times_s) is None
+    verdicts = decide(replace(cooling, weather=windy))
+    assert verdicts["relaxation"].on and verdicts["relaxation"].told, verdicts["relaxation"]
+    assert not verdicts["harmonic_source"].on and verdicts["harmonic_source"].told, verdicts["harmonic_source"]

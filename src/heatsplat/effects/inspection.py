@@ -76,7 +76,8 @@ class Inspection:
         """What images show beside the one source that all points answer; None where there is no such source, where a weather
         record says more, and where the camera stands still."""
         source = self.heat_source
-        alone = source is not None and source.common and self.scene.weather is None and self.joint[0].data.moves
+        alone = source is not None and source.common and not weather_record.drives(self.scene.weather)
+        alone = alone and self.joint[0].data.moves
         return heat_source.beside(self, source.course) if alone else None
 
     @cached_property

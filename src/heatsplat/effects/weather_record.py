@@ -22,11 +22,17 @@ def directed(scene: SceneData) -> str | None:
     return f"the weather lacks {', '.join(lacks)}, which it needs" if lacks else None
 
 
+def drives(weather: Weather | None) -> bool:
+    """Whether a record says what surfaces follow over time: air or sun. Wind and rain alone warm and cool nothing."""
+    return weather is not None and (weather.air_c is not None or weather.irradiance_w_m2 is not None)
+
+
 def drivers(weather: Weather | None, times_s: Tensor | None, air: tuple[float, ...] = (SLOW_PER_S,)) -> Tensor | None:
-    """Answers [F, k] to air (of bodies of these rates) and sun at the frames' times, of unit size; None without a record."""
-    if weather is None or times_s is None:
+    """Answers [F, k] to air (of bodies of these rates) and sun at the frames' times, of unit size; None without a record that
+    ``drives``."""
+    if times_s is None or not drives(weather):
         return None
-    found = [torch.zeros(len(times_s), 0, dtype=torch.float64)]
+    found = []
     if weather.air_c is not None:
         found.append(_answers(weather, weather.air_c, air, times_s))
     if weather.irradiance_w_m2 is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from heatsplat.effects import heat_source
+from heatsplat.effects import heat_source, weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.joint.courses import common_courses
@@ -24,9 +24,9 @@ HARMONIC, COMMON = "harmonics", "common"  # values of effects.source
 
 def evidence(inspected: Inspection) -> Evidence:
     """Whether something drives the scene, and what says how."""
-    beside = "any relaxation" if inspected.scene.weather is None else "what the weather does"
-    source = inspected.heat_source
-    if inspected.scene.weather is not None and source is None:
+    driven, source = weather_record.drives(inspected.scene.weather), inspected.heat_source
+    beside = "what the weather does" if driven else "any relaxation"
+    if driven and source is None:
         return Evidence(0.0, "the recorded weather stands for what drives the scene")
     found = gained(inspected, heat_source.NAME, f"points depart from {beside} by")
     if source is None:
@@ -50,12 +50,15 @@ def evidence(inspected: Inspection) -> Evidence:
 def passing(inspected: Inspection) -> Evidence | None:
     """Whether something hot passes points that cool otherwise; None where nothing does. Points then share no course over time,
     but each has a moment of its own, which takes all the harmonics there are."""
-    if inspected.scene.weather is not None or not selected_kind(inspected, "relaxation"):
+    if weather_record.drives(inspected.scene.weather) or not selected_kind(inspected, "relaxation"):
         return None
     times = share_of_points(*inspected.joint)
     if times <= EFFECT.threshold:
         return None
-    said = f"{times:.1f} times as many points as by chance change by much at moments of their own, as where something passes them"
+    said = (
+        f"{times:.1f} times as many points as by chance change by much, and the same way, at moments of their own, as where "
+        "something passes them"
+    )
     return Evidence(times, said, settings={"source": HARMONIC, "frequencies": heat_source.HARMONICS[-1]})
 
 
@@ -82,7 +85,7 @@ EFFECT = Effect(
     source="ETGS, Eq. 6-8; a common course: ours",
     needs=frozenset({"time"}),
     null="all changes are mixtures of relaxations",
-    # Up to 1.3 without it, and 5.0 once, in haze; from 3.4 with it. Of points that something passes: up to 1.5 and from 5.0.
+    # Up to 1.3 without it, and 5.0 once, in haze; from 3.4 with it. Of points that something passes: up to 0.5 and from 3.3.
     threshold=OWN_HURDLE,
     adds="2 K amplitudes for each Gaussian, 11 K operations; a common course: 6 numbers in place of all, 6 operations",
     evidence=evidence,
