@@ -267,6 +267,18 @@ def test_the_log_tells_verdict_statistic_price_and_reason():
     assert of["tone"] == ["tone", "?", "0.5", "≤", "1", "as", "measured"]
 
 
+def test_what_a_rule_decides_is_told_whatever_images_tell():
+    """The report says "cannot be told" of what images leave open, with what would tell; here more images would tell nothing."""
+    unsure = {name: replace(one, told=False, gain_db=0.1) for name, one in verdicts("harmonic_source", "solar").items()}
+    found = assembly.reconcile(unsure)
+    off, ground = found["harmonic_source"], found["relaxation"]
+    assert not off.on and off.told and off.reason == "the recorded weather drives the scene"
+    assert ground.on and ground.told and ground.reason == "solar stands on it"
+    assert found["solar"].on and not found["solar"].told
+    dear = assembly.affordable(found, {"solar": Price(1, 0, 4.0)}, 1.0)["solar"]
+    assert not dear.on and dear.told and "4.00 ms" in dear.reason
+
+
 def test_an_effect_that_costs_more_than_it_brings_is_left_out_when_that_is_asked():
     known = {name: replace(one, gain_db=1.0) for name, one in verdicts("relaxation", "conduction", "agc").items()}
     prices = {"relaxation": Price(2, 0, 4.0), "conduction": Price(0, 1, 0.1), "agc": Price(0, 9, -0.01)}

@@ -79,7 +79,7 @@ def drop_impossible(verdicts: Mapping[str, Verdict], scene: SceneData) -> dict[s
     for name in _on(verdicts):
         reason = _effect(name).missing(scene)
         if reason is not None:
-            found[name] = replace(found[name], on=False, reason=reason)
+            found[name] = replace(found[name], on=False, reason=reason, told=True)
     return found
 
 
@@ -107,7 +107,7 @@ def reconcile(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None =
             raise SceneError(
                 f"effects.{name}={given[name]} is not possible: {reason}; leave it out or change the other"
             )
-        found[name] = replace(found[name], on=on, reason=reason)
+        found[name] = replace(found[name], on=on, reason=reason, told=True)  # whatever images tell
 
     for name, choice in given.items():
         if choice == "on" and not found[name].on:
@@ -173,8 +173,8 @@ def affordable(
         why = f"{gain:.1f} dB for {price.ms_per_step:.2f} ms a step are less than effects.least_db_per_ms={least_db_per_ms:g}"
         found = without(found, name)
         for other in gone:
-            found[other] = replace(found[other], reason=f"it stands on {name}, which is off")
-        found[name] = replace(found[name], reason=why)
+            found[other] = replace(found[other], reason=f"it stands on {name}, which is off", told=True)
+        found[name] = replace(found[name], reason=why, told=True)
     return found
 
 
