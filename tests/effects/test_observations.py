@@ -55,6 +55,28 @@ def test_a_long_flight_is_followed_in_runs_and_a_short_one_or_an_orbit_is_not():
     assert frames_to_follow(long.train.frames, long.points[:0], 64)[:3] == [0, 5, 9]
 
 
+def test_images_of_the_size_that_most_have_are_looked_at_wherever_the_others_are():
+    """The first image is twice as large, as one of another camera: all others are compared, and it is not."""
+    scene = flight(20)
+    first = scene.train.frames[0]
+    K = torch.diag(torch.tensor([2.0, 2.0, 1.0], dtype=torch.float64)) @ first.camera.K
+    large = replace(first, camera=Camera(first.camera.viewmat, K, 2 * WIDTH, 2 * HEIGHT))
+
+    def decode(i: int) -> View:
+        view = scene.train[i]
+        if i:
+            return view
+        twice = functional.interpolate(view.thermal[None, ..., 0][None], scale_factor=2.0, mode="bilinear")
+        return replace(view, frame=large, thermal=twice[0, 0, ..., None])
+
+    mixed = replace(scene, train=ViewSet((large, *scene.train.frames[1:]), decode))
+    assert frames_to_follow(mixed.train.frames, mixed.points, 64) == list(range(1, 20))
+    assert frames_to_follow(mixed.train.frames, mixed.points, 5) == [1, 5, 10, 15, 19]
+    seen = observe(mixed)
+    assert len(seen.frames) == 19 and seen.tracks is not None
+    assert material_of(mixed).chosen == list(range(1, 20))
+
+
 def test_points_of_a_long_flight_are_tracked_and_all_of_its_frames_count():
     scene = flight(300)
     tracks = observe(scene).tracks

@@ -8,6 +8,7 @@ what is worked out from them is float64.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -167,11 +168,16 @@ def read(
 
 
 def frames_to_follow(frames: Sequence[Frame], points: Tensor, limit: int) -> list[int]:
-    """At most ``limit`` positions of frames through which points can be followed, in order.
+    """At most ``limit`` positions of frames through which points can be followed, in order: of those of the size that most have.
 
     They are evenly spread. Where too few points are then seen often enough, as on a long flight, runs of frames that follow each
     other are, of the shortest of ``LENGTHS`` that will do, or else of that which comes nearest.
     """
+    sizes = [(frame.camera.height, frame.camera.width) for frame in frames]
+    if len(set(sizes)) > 1:
+        usual = Counter(sizes).most_common(1)[0][0]
+        alike = [i for i, size in enumerate(sizes) if size == usual]
+        return [alike[i] for i in frames_to_follow([frames[i] for i in alike], points, limit)]
     even = evenly_spread(len(frames), limit)
     if len(frames) <= limit or len(points) == 0:
         return even
