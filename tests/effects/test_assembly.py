@@ -313,6 +313,24 @@ def test_selections_and_single_choices():
     assert assembly.explicit_choices(yaml_words) == {"solar": "on", "agc": "off"}
 
 
+@pytest.mark.parametrize(
+    "given, why",
+    [
+        (["effects.least_db_per_ms=0.5", "effects.price=false"], "effects.price=false does not measure"),
+        (["effects.least_db_per_ms=-1"], "must be 0 or more, got -1"),
+        (["effects.least_db_per_ms=much"], "must be a number, got much"),
+    ],
+)
+def test_a_least_gain_that_nobody_can_ask_for_is_refused(given, why):
+    with pytest.raises(SceneError, match=f"effects.least_db_per_ms.*{why}"):
+        assembly.least_db_per_ms(config("method=auto", *given)["effects"])
+
+
+def test_a_least_gain_is_zero_unless_one_is_asked_for():
+    assert assembly.least_db_per_ms(config("method=auto", "effects.price=false")["effects"]) == 0
+    assert assembly.least_db_per_ms(config("method=auto", "effects.least_db_per_ms=2")["effects"]) == 2
+
+
 def test_choices_that_cannot_be_are_refused():
     with pytest.raises(SceneError, match="effects.agc must be one of on, off, auto, got 'maybe'"):
         assembly.choices(config("method=auto", "effects.agc=maybe")["effects"])

@@ -7,7 +7,7 @@ from copy import deepcopy
 from dataclasses import asdict, replace
 from typing import Any
 
-from heatsplat.contracts import SceneData, SceneError, check_option, rounded
+from heatsplat.contracts import SceneData, SceneError, check_numbers, check_option, rounded
 from heatsplat.effects.base import CHOICES, SLOTS, Effect, Verdict
 from heatsplat.effects.catalogue import CATALOGUE
 
@@ -71,6 +71,24 @@ def chooses_effects(config: Mapping[str, Any]) -> bool:
             "or the method's own options (thermal.*, sensor.*)."
         )
     return chosen
+
+
+def least_db_per_ms(effects: Mapping[str, Any]) -> float:
+    """Decibels that an effect must gain for each millisecond that a step takes longer, of the group "effects".
+
+    Raises:
+        SceneError: it is no number of 0 or more, or what effects cost is not to be measured.
+    """
+    least = effects["least_db_per_ms"]
+    check_numbers("effects.least_db_per_ms", least, error=SceneError)
+    if least < 0:
+        raise SceneError(f"effects.least_db_per_ms must be 0 or more, got {least:g}; 0 asks nothing of an effect")
+    if least > 0 and not effects["price"]:
+        raise SceneError(
+            f"effects.least_db_per_ms={least:g} asks what each effect costs, which effects.price=false does not measure; leave "
+            "one of them out"
+        )
+    return least
 
 
 def drop_impossible(verdicts: Mapping[str, Verdict], scene: SceneData) -> dict[str, Verdict]:
@@ -153,24 +171,24 @@ def without(verdicts: Mapping[str, Verdict], name: str) -> dict[str, Verdict]:
 def affordable(
     verdicts: Mapping[str, Verdict],
     prices: Mapping[str, Any],
-    least_db_per_ms: float,
+    least: float,
     given: Mapping[str, str] | None = None,
 ) -> dict[str, Verdict]:
     """The verdicts without the effects that gain less on held-out observations than so many decibels per millisecond that a
-    step of training takes longer, and without those that stand on them; 0 keeps all, and what was asked for (``given``, of
-    ``explicit_choices``) stays with what it stands on."""
+    step of training takes longer (``least_db_per_ms``), and without those that stand on them; 0 keeps all, and what was asked
+    for (``given``, of ``explicit_choices``) stays with what it stands on."""
     found = dict(verdicts)
-    if least_db_per_ms == 0:  # where images cannot tell, what was left out may gain less than nothing
+    if least == 0:  # where images cannot tell, what was left out may gain less than nothing
         return found
     asked = {name for name, choice in (given or {}).items() if choice == "on"}
     for name in _on(verdicts):
         gain, price = verdicts[name].gain_db, prices.get(name)
-        if gain is None or price is None or gain >= least_db_per_ms * price.ms_per_step or not found[name].on:
+        if gain is None or price is None or gain >= least * price.ms_per_step or not found[name].on:
             continue
         gone = [other for other in dependents(name) if found[other].on]
         if asked.intersection(gone):
             continue
-        why = f"{gain:.1f} dB for {price.ms_per_step:.2f} ms a step are less than effects.least_db_per_ms={least_db_per_ms:g}"
+        why = f"{gain:.1f} dB for {price.ms_per_step:.2f} ms a step are less than effects.least_db_per_ms={least:g}"
         found = without(found, name)
         for other in gone:
             found[other] = replace(found[other], reason=f"it stands on {name}, which is off", told=True)

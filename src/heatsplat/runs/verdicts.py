@@ -26,6 +26,7 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
     """
     if "verdicts" in config or not assembly.chooses_effects(config):
         return config
+    least = assembly.least_db_per_ms(config["effects"])
     began = time.perf_counter()
     verdicts, costs = decide_effects(config["effects"], scene), {}
     if config["effects"]["price"]:
@@ -44,7 +45,7 @@ def decided(config: dict[str, Any], scene: SceneData) -> dict[str, Any]:
             device_of(config["trainer"]["accelerator"], config["renderer"]),
         )
         given = assembly.explicit_choices(config["effects"])
-        verdicts = assembly.affordable(verdicts, costs, config["effects"]["least_db_per_ms"], given)
+        verdicts = assembly.affordable(verdicts, costs, least, given)
     found = assembly.verdicts_as_dicts(verdicts, costs)
     for line in assembly.verdict_table(found):
         log.info("%s", line)
