@@ -1,5 +1,6 @@
 """Heat that flows between neighbours beside a source: contrasts answer it faster than levels do."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -66,3 +67,16 @@ def test_a_source_whose_course_nobody_knows_hides_a_flow(source):
 def test_contrasts_that_few_neighbours_show_tell_nothing():
     values = lit(0.0, ALIKE).mean(0, keepdim=True).expand(POINTS, FRAMES)
     assert not evidence(seen(values, KNOWN)).told
+
+
+@pytest.mark.parametrize("ambient, of", [(0.0, r"surroundings by \(12 °C\)"), (None, "nobody knows the surroundings")])
+def test_the_reason_says_of_what_levels_fade(ambient, of):
+    """Given a temperature that nothing settles at, levels seem to fade less than contrasts: who reads that can tell."""
+    fading = 0.3 + 0.1 * (2.0 + drawn(POINTS, 1, seed=6)) * torch.exp(-2.0 * PASSED)
+    inspected = seen(fading, None)
+    inspected.joint = (
+        replace(inspected.joint[0], data=replace(inspected.joint[0].data, ambient=ambient)),
+        Model.of(relaxation=1),
+    )
+    inspected.obs.ambient, inspected.scene.ambient_c = ambient, 12.0
+    assert re.search(of, evidence(inspected).reason)

@@ -63,10 +63,24 @@ def evidence(inspected: Inspection) -> Evidence:
     still = (remains[strong] / contrast[strong]).median().clamp_min(LEFT)
     rate = float(still.log() / kept.clamp(LEFT, 0.999).log())
     statistic = (rate - 1.0) / (FASTER - 1.0)
-    found = f"contrasts between neighbours fade to {float(still):.2f} while levels fade to {float(kept):.2f}"
+    found = (
+        f"contrasts between neighbours fade to {float(still):.2f} while levels fade to {float(kept):.2f} of "
+        f"{_of_what(inspected, model)}"
+    )
     if UNSURE[0] < statistic < UNSURE[1]:
         return Evidence(statistic, f"{found}: cannot be told, bodies of two rates would do that as well", told=False)
     return Evidence(statistic, found)
+
+
+def _of_what(inspected: Inspection, model: Model) -> str:
+    """What levels fade in, in words: where surfaces settle at another temperature than the surroundings are said to have, levels
+    seem to fade less than contrasts."""
+    if "frame_offset" in model.names:
+        return "what they differ by"
+    ambient_c = inspected.scene.ambient_c
+    if inspected.obs.ambient is None:
+        return "what they differ from the coldest of them by, or the warmest, as nobody knows the surroundings"
+    return f"what they differ from the surroundings by ({ambient_c:g} °C)"
 
 
 def _driven(inspected: Inspection) -> Evidence:
