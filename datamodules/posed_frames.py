@@ -18,7 +18,7 @@ from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats import temperature_table
 from heatsplat.datamodules.formats.colmap import SparseModel
 from heatsplat.datamodules.formats.colmap_records import announced_images
-from heatsplat.datamodules.formats.images import ImageIndex
+from heatsplat.datamodules.formats.images import ImageIndex, list_images
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
 from heatsplat.datamodules.formats.radiometric import read_thermal
 from heatsplat.datamodules.points import obj_vertices, random_points, told_random
@@ -40,6 +40,10 @@ def image_index(folder: Path, images: str, key: str) -> ImageIndex:
                 f", but tables such as {table.name}: python src/prepare.py source={index.folder} target=NEW_FOLDER poses=given "
                 f"poses.model={folder} makes a scene of tables of °C"
             )
+        elif having := [
+            f"{path.name}/" for path in sorted(folder.iterdir()) if path != index.folder and list_images(path)
+        ]:
+            what += f"; images lie in {', '.join(having)}"
         raise SceneError(f"{key}={images}: {index.folder} {what}")
     return index
 

@@ -80,6 +80,13 @@ def test_two_cameras_of_a_model_in_folders_of_their_own_are_not_taken_for_each_o
         loaded(tmp_path)
 
 
+def test_where_images_lie_is_told_where_their_folder_is_not_there(tmp_path):
+    write_colmap(tmp_path, names(3), images="thermal")
+    with pytest.raises(SceneError, match="data.images=images: .*/images does not exist; images lie in thermal/$"):
+        loaded(tmp_path)
+    assert loaded(tmp_path, images="thermal").train
+
+
 def test_what_is_nearly_a_model_is_told(tmp_path):
     write_colmap(tmp_path / "s", names(3))
     (tmp_path / "s" / "sparse" / "0").rename(tmp_path / "s" / "sparse" / "1")
