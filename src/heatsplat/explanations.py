@@ -188,7 +188,9 @@ def _quoted(override: str) -> str:
     """How a setting is written whose value Hydra's grammar does not take as it stands, such as a path with a space."""
     key, _, value = override.partition("=")
     if re.fullmatch(r"[+-]?\d+,\d+", value):
-        return f"A number has a decimal point: {key}={value.replace(',', '.')}"
+        return (
+            f"A number has a decimal point: {key}={value.replace(',', '.')}; two numbers have brackets: {key}=[{value}]"
+        )
     if re.fullmatch(r"\[[^][{}'\"]*\]?", value):  # without its end where a shell took it apart at a space
         given = [word.strip() for word in value.strip("[]").split(",") if word.strip()]
         words = [word if PLAIN.fullmatch(word) else setting("", word)[1:] for word in given]

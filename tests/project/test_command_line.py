@@ -381,6 +381,7 @@ def test_a_command_without_arguments_shows_how_it_is_used_and_trains_nothing(tmp
         ("data.root=/data/Flug über Köln, 2. Tag", "\"data.root='/data/Flug über Köln, 2. Tag'\""),
         ("data.root=/data/flight,2", "\"data.root='/data/flight,2'\""),
         ("data.ambient_c=20,5", "data.ambient_c=20.5"),
+        ("data.bounds_c=20,30", "two numbers have brackets: data.bounds_c=[20,30]"),
     ],
 )
 def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path, told):
