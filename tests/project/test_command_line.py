@@ -553,6 +553,6 @@ def test_results_stay_those_of_their_settings(finished, told):
     others = ("optim.means=1e-3", f"hydra.run.dir={finished}")
     assert "other settings (optim.means)" in told("train", "method=etgs", *TINY, *others, cwd=finished, code=1)
     longer = ("max_steps=21", f"hydra.run.dir={finished}")  # whose density control and schedules differ as well
-    assert "other settings (max_steps, exposure." in told("train", "method=etgs", *TINY, *longer, cwd=finished, code=1)
+    assert "other settings (max_steps, " in told("train", "method=etgs", *TINY, *longer, cwd=finished, code=1)
     assert len(before) == 3 and before == {path: path.read_bytes() for path in (finished / ".hydra").iterdir()}
     assert not (finished / "FAILED").exists()
