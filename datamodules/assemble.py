@@ -287,6 +287,11 @@ def _with_pseudo_colour(
         notes["pseudo_colour"] = (
             f"{counted(len(colour), 'image')} in pseudo-colour; the luma is used and is no temperature"
         )
+        log.warning(
+            "%s, such as %s: a palette's luma need not rise with temperature. Give radiometric files, counts, or greys with "
+            "their bounds; data.thermal_channels=3 trains on the colours as they are, without °C",
+            *(notes["pseudo_colour"], next(iter(colour))),
+        )
     return raw
 
 

@@ -129,12 +129,15 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         """All held-out views."""
         return DataLoader(self.scene.test, batch_size=None, num_workers=0)
 
-    def scene_folder(self, is_scene: Callable[[Path], bool], looked_for: str) -> Path:
+    def scene_folder(
+        self, is_scene: Callable[[Path], bool], looked_for: str, nearly: Callable[[Path], str] = lambda _: ""
+    ) -> Path:
         """The folder of the scene: ``root``/``scene``, or ``root`` itself when no scene is named.
 
         Args:
             is_scene: whether a folder holds a scene of this data set.
             looked_for: what makes it one, for the message.
+            nearly: what makes one of a folder that nearly is, in words; empty for others.
 
         Raises:
             SceneError: no root, or no such scene; the message lists the scenes that are there.
@@ -154,7 +157,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
                 + (
                     f"choose one with data.scene: {', '.join(scenes)}"
                     if scenes
-                    else f"it holds {_listed(root)}. {_towards_a_scene(root)}"
+                    else f"it holds {_listed(root)}. {nearly(root) or _towards_a_scene(root)}"
                 )
             )
         folder = root / self.scene_name
@@ -163,7 +166,10 @@ class SceneDataModule(pl.LightningDataModule, ABC):
                 f"data.scene={self.scene_name}: there is no such scene in {root}; it holds {_listed(root)}"
             )
         if not is_scene(folder):
-            raise SceneError(f"data.scene={self.scene_name}: {looked_for} is missing; {folder} holds {_listed(folder)}")
+            hint = f". {hint}" if (hint := nearly(folder)) else ""
+            raise SceneError(
+                f"data.scene={self.scene_name}: {looked_for} is missing; {folder} holds {_listed(folder)}{hint}"
+            )
         return folder
 
     def mask_index(self, scene: Path) -> ImageIndex | None:

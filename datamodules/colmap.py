@@ -13,12 +13,12 @@ import numpy as np
 from heatsplat.contracts import SceneData, SceneError, ThermalRange, check_option
 from heatsplat.datamodules.base import CELSIUS, Counts, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
-from heatsplat.datamodules.formats.colmap import find_model, read_model
+from heatsplat.datamodules.formats.colmap import find_model, nearly_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius, read_thermal
 from heatsplat.datamodules.frame_times import FRAMES_FILE, FrameTimes
 from heatsplat.datamodules.points import random_points, told_random
-from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames
+from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames, named_as_files
 from heatsplat.datamodules.side_files import finite, json_object
 
 # Of a prepared folder: metres_per_unit of the sparse model, and its axes, where GPS has told them.
@@ -114,12 +114,13 @@ class Colmap(SceneDataModule):
         self.random_points = random_points
 
     def load(self) -> SceneData:
-        folder = self.scene_folder(lambda p: find_model(p) is not None, "a sparse model (sparse/0)")
+        folder = self.scene_folder(lambda p: find_model(p) is not None, "a sparse model (sparse/0)", nearly_model)
         model = read_model(folder)
         raw = image_index(folder, self.raw, "data.raw") if self.raw else None
         rgb = image_index(folder, self.rgb, "data.rgb") if self.rgb else None
         index = raw or (image_index(folder, self.images, "data.images") if self.images else rgb)
 
+        model = named_as_files(model, index)
         files = {name: index.find(name) for name in model.names}
         kept, notes = match_model(model, files, index, self.raw or self.images or self.rgb)
         read, counts, encoding = self._reader(raw, index, [files[i] for i in kept])

@@ -29,9 +29,10 @@ class FrameTimes:
 
     Args:
         time_regex: picks the time out of an image name (first group), or None.
-        time_format: strptime format of it, HHMMSSmmm, or None for a number of seconds.
+        time_format: strptime format of it, and of the times in ``time_csv``, HHMMSSmmm, or None for a number of seconds (in the
+            table also ISO date-times).
         time_csv: table of times, relative to the scene or the working directory, or None.
-        time_csv_name, time_csv_time: its columns of image names and of times (seconds or ISO date-times).
+        time_csv_name, time_csv_time: its columns of image names and of times.
     """
 
     time_regex: str | None = None
@@ -63,11 +64,9 @@ class FrameTimes:
             return self._table(folder, names)
         if self.time_regex:
             told = f"file names, {self.time_regex} as {self.time_format or 'seconds'}"
-            seconds = [time_by_pattern(name, self.time_regex, self.time_format) for name in names]
-            if is_of_day(self.time_format):
-                seconds, passed = unrolled_midnight(seconds)
-                told += "; 24 h were added to those after midnight" if passed else ""
-            return dict(zip(names, seconds, strict=True)), told
+            return self._past_midnight(
+                {name: time_by_pattern(name, self.time_regex, self.time_format) for name in names}, told
+            )
         if written is not None:
             return written, where
         path, told = folder / FRAMES_FILE, ""  # without times where a frame had none
@@ -86,13 +85,22 @@ class FrameTimes:
 
     def _table(self, folder: Path, names: Sequence[str]) -> tuple[Mapping[str, float], str]:
         path = found_file("data.time_csv", self.time_csv, folder)
-        times = _looked_up(times_from_csv(path, self.time_csv_name, self.time_csv_time), names, path)
+        table = times_from_csv(path, self.time_csv_name, self.time_csv_time, self.time_format)
+        times = _looked_up(table, names, path)
         if missing := [name for name in names if name not in times]:
             raise SceneError(
                 f"data.time_csv: {path} has no row for {missing[0]} ({len(missing)} of {len(names)} images); "
                 f"column {self.time_csv_name} must hold the image names"
             )
-        return times, f"{path.name}, column {self.time_csv_time}"
+        return self._past_midnight(times, f"{path.name}, column {self.time_csv_time}")
+
+    def _past_midnight(self, times: Mapping[str, float], told: str) -> tuple[Mapping[str, float], str]:
+        """Times by image name, and what is told of them; those of a day go on past midnight."""
+        if not is_of_day(self.time_format):
+            return times, told
+        seconds, passed = unrolled_midnight(list(times.values()))
+        told += "; 24 h were added to those after midnight" if passed else ""
+        return dict(zip(times, seconds, strict=True)), told
 
 
 def _looked_up(times: Mapping[str, float], names: Sequence[str], path: Path) -> dict[str, float]:

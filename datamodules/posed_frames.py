@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,10 +14,11 @@ import numpy as np
 
 from heatsplat.contracts import SceneError, counted
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
+from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats import temperature_table
 from heatsplat.datamodules.formats.colmap import SparseModel
 from heatsplat.datamodules.formats.colmap_records import announced_images
-from heatsplat.datamodules.formats.images import ImageIndex
+from heatsplat.datamodules.formats.images import ImageIndex, list_images
 from heatsplat.datamodules.formats.nerfstudio import lens_in, read_transforms, viewmat_of
 from heatsplat.datamodules.formats.radiometric import read_thermal
 from heatsplat.datamodules.points import obj_vertices, random_points, told_random
@@ -38,8 +40,27 @@ def image_index(folder: Path, images: str, key: str) -> ImageIndex:
                 f", but tables such as {table.name}: python src/prepare.py source={index.folder} target=NEW_FOLDER poses=given "
                 f"poses.model={folder} makes a scene of tables of °C"
             )
+        elif having := [
+            f"{path.name}/" for path in sorted(folder.iterdir()) if path != index.folder and list_images(path)
+        ]:
+            what += f"; images lie in {', '.join(having)}"
         raise SceneError(f"{key}={images}: {index.folder} {what}")
     return index
+
+
+def named_as_files(model: SparseModel, index: ImageIndex) -> SparseModel:
+    """The model with the names of the files in a folder, where its own name other folders throughout, such as those of the
+    computer that made it, and the names of files alone tell which is which; else as it is."""
+    if any(index.find(name) for name in model.names):
+        return model
+    files = {name: found[0] for name, found in same_files(model.names, index.names).items() if len(found) == 1}
+    if not files or len(set(files.values())) < len(files):  # of two cameras, say, in folders of their own
+        return model
+    log.info("images of %s are known by the names of their files, whatever folders it names", model.folder)
+    names = [files.get(name, name) for name in model.names]
+    order = sorted(range(len(names)), key=names.__getitem__)
+    picked = {key: tuple(getattr(model, key)[i] for i in order) for key in ("viewmats", "lenses")}
+    return replace(model, names=tuple(names[i] for i in order), **picked)
 
 
 def match_model(

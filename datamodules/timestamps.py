@@ -90,18 +90,26 @@ def time_by_pattern(name: str, regex: str, form: str | None) -> float:
         raise SceneError(f"data.time_regex {regex!r} does not match the image name {name}")
     part = match[1] if match.re.groups else match[0]
     try:
-        if form is None:
-            return float(part)
-        return seconds_of_day(part) if form == "HHMMSSmmm" else instant(datetime.strptime(part, form))
+        return float(part) if form is None else _of_form(part, form)
     except ValueError as error:
         raise SceneError(f"image name {name}: {part!r} is no time of the form {form or 'seconds'} ({error})") from error
 
 
-def times_from_csv(path: Path, name_column: str, time_column: str) -> dict[str, float]:
-    """Seconds by file, named as in the table; the time column holds seconds or ISO 8601 date-times.
+def _of_form(text: str, form: str) -> float:
+    """Seconds of a time that is written in a form of ``time_by_pattern``. Raises ValueError for other text."""
+    return seconds_of_day(text) if form == "HHMMSSmmm" else instant(datetime.strptime(text, form))
+
+
+def times_from_csv(path: Path, name_column: str, time_column: str, form: str | None = None) -> dict[str, float]:
+    """Seconds by file, named as in the table; the time column holds seconds or ISO 8601 date-times, or times of a form.
+
+    Args:
+        path: of the table.
+        name_column, time_column: its columns.
+        form: strptime format of the times, or "HHMMSSmmm"; None for seconds and ISO 8601 date-times.
 
     Raises:
-        SceneError: no such column, a cell that is neither, or two times of one file.
+        SceneError: no such column, a cell that is no such time, or two times of one file.
     """
     table = read_table(path)
     for key, column in (("time_csv_name", name_column), ("time_csv_time", time_column)):
@@ -112,14 +120,17 @@ def times_from_csv(path: Path, name_column: str, time_column: str) -> dict[str, 
     for number, row in table.rows:
         cell = row[time_at]
         try:
-            seconds = seconds_of(table.pointed(cell))
+            seconds = seconds_of(table.pointed(cell)) if form is None else _of_form(cell, form)
             if not math.isfinite(seconds):
                 raise ValueError(cell)
         except ValueError as error:
-            raise SceneError(
-                f"{path}, line {number}: {cell!r} in column {time_column} is neither seconds nor a date-time "
-                "such as 2024-08-06T15:35:05.376"
-            ) from error
+            other = f"no time of the form {form} (data.time_format; null takes seconds and ISO date-times)"
+            if form is None:
+                other = (
+                    "neither seconds nor a date-time such as 2024-08-06T15:35:05.376; how others are written says "
+                    "\"data.time_format='%d.%m.%Y %H:%M:%S'\" or data.time_format=%H:%M:%S"
+                )
+            raise SceneError(f"{path}, line {number}: {cell!r} in column {time_column} is {other}") from error
         if times.setdefault(row[name_at], seconds) != seconds:
             raise SceneError(
                 f"{path}, line {number}: {row[name_at]} has another time in a line above; keep one of them"

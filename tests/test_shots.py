@@ -63,6 +63,18 @@ def test_without_coverage_every_pixel_is_written(tmp_path, caplog):
     assert "no training view" not in caplog.text
 
 
+def test_frames_of_an_earlier_shot_in_the_same_folder_are_told(tmp_path, caplog):
+    """Three frames, then two of another moment: the third would pass for one of them."""
+    scene = make_scene()
+    for count, told in ((3, ""), (3, ""), (2, "2 files in .* left of an earlier command, such as png/0_0002.png")):
+        frames = shot_frames(scene, "view", [0.0, 10.0], 0, count)
+        image = {"recorded": torch.full((frames[0].camera.height, frames[0].camera.width, 1), 0.5)}
+        with caplog.at_level(logging.WARNING, "heatsplat"):
+            write_shot([(image, None)] * count, frames, scene, ShotFiles(tmp_path, video=False))
+        assert re.search(told, caplog.text) if told else "earlier command" not in caplog.text
+    assert (tmp_path / "tiff" / "0_0002.tiff").exists()  # which may be wanted
+
+
 def test_every_image_of_a_frame_has_files_of_its_own_and_one_range(tmp_path):
     scene = make_scene()
     frames = shot_frames(scene, "view", [0.0, 10.0], 0, 2)

@@ -54,6 +54,15 @@ def is_model(folder: Path) -> bool:
     return any((folder / f"cameras.{suffix}").is_file() for suffix in ("bin", "txt"))
 
 
+def nearly_model(scene: Path) -> str:
+    """What makes a sparse model of what a scene folder has in place of one, in words; empty where it has nothing like it."""
+    for place in PLACES:
+        if any((scene / place / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):
+            return f"{place} has images, and neither cameras.bin nor cameras.txt: copy the model or export it from COLMAP again"
+    others = [path for path in sorted((scene / "sparse").glob("*")) if is_model(path)]
+    return f"sparse/{others[0].name} is a model: rename it to sparse/0" if others else ""
+
+
 def read_model(scene: Path) -> SparseModel:
     """The sparse model of a scene folder.
 

@@ -256,6 +256,11 @@ def train(config: dict[str, Any], output_dir: Path) -> float | None:
     launcher = HydraConfig.get().runtime.choices.launcher
     if launcher not in (None, "basic") and HydraConfig.get().mode != RunMode.MULTIRUN:
         log.warning("launcher=%s starts the jobs of a sweep; this single run trains right here: add -m", launcher)
+    if HydraConfig.get().sweeper.get("rows") and HydraConfig.get().mode != RunMode.MULTIRUN:
+        raise SceneError(
+            "the rows of an ablation (hydra.sweeper.rows) are jobs of a sweep, and this is a single run: add -m, or write mode: "
+            "MULTIRUN below hydra: in the file of the ablation"
+        )
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         clear_away()
     if (first := config.get("table", {}).get("after")) is not None:

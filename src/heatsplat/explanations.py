@@ -16,7 +16,7 @@ from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseExceptio
 
 from heatsplat.composition import CONF, compose_unresolved, options_of
 from heatsplat.errors import SceneError
-from heatsplat.io.command_lines import PLAIN, as_dict, setting, typed
+from heatsplat.io.command_lines import PLAIN, as_dict, config_dirs, setting, typed
 from heatsplat.io.settings import walk
 
 # What a disk says that is full, may not be written to, or has a file where a folder is to be: no traceback helps.
@@ -26,7 +26,7 @@ NO_PLACE |= dict.fromkeys(
     (errno.EEXIST, errno.ENOTDIR), "a file is where a folder is to be: remove it, or give another folder"
 )
 # What OmegaConf says of a resolver of ours that does not take a setting; the key that it names is that of who asked.
-RESOLVED = r"ValueError raised while resolving interpolation: (max_steps must be .*)"
+RESOLVED = r"ValueError raised while resolving interpolation: ((?:max_steps|ckpt) must be .*)"
 # What a command takes where someone typed folders alone.
 FOLDERS = {"prepare": "source=FOLDER target=FOLDER"}
 
@@ -148,7 +148,10 @@ def _did_you_mean(near: Sequence[str]) -> str:
 
 def _of_unknown_key(wrong: str, command: str, arguments: Sequence[str]) -> str:
     """Keys like one that there is not, or what stands beside it; empty where nothing is like it."""
-    others = [text for text in arguments if not text.startswith(("-", wrong))]
+    folders, given = config_dirs(arguments)
+    others = [text for text in given if not text.startswith(("-", wrong))]
+    if folders:  # whose methods and models the command may choose
+        others.append(setting("hydra.searchpath", f"file://{folders[0].absolute()}").replace("=", "=[", 1) + "]")
     try:
         settings = OmegaConf.to_container(compose_unresolved(others, command))
     except (CompactHydraException, OmegaConfBaseException):  # it was not the only mistake
@@ -185,7 +188,9 @@ def _quoted(override: str) -> str:
     """How a setting is written whose value Hydra's grammar does not take as it stands, such as a path with a space."""
     key, _, value = override.partition("=")
     if re.fullmatch(r"[+-]?\d+,\d+", value):
-        return f"A number has a decimal point: {key}={value.replace(',', '.')}"
+        return (
+            f"A number has a decimal point: {key}={value.replace(',', '.')}; two numbers have brackets: {key}=[{value}]"
+        )
     if re.fullmatch(r"\[[^][{}'\"]*\]?", value):  # without its end where a shell took it apart at a space
         given = [word.strip() for word in value.strip("[]").split(",") if word.strip()]
         words = [word if PLAIN.fullmatch(word) else setting("", word)[1:] for word in given]

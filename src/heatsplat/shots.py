@@ -22,6 +22,7 @@ from heatsplat.contracts import (
     check_count,
     check_numbers,
     check_option,
+    counted,
     evenly_spread,
     quantile,
 )
@@ -258,6 +259,11 @@ class ShotFiles:
         self.written.append(self.folder / name)
         return self.written[-1]
 
+    def of_others(self) -> list[Path]:
+        """Files of the same kinds in the folder that this shot did not write."""
+        kinds = ("tiff*/*.tiff", "png*/*.png", "video*.mp4", "figures/*")
+        return sorted({path for kind in kinds for path in self.folder.glob(kind)} - {*self.written})
+
     def add_values(self, suffix: str, stem: str, values: Tensor) -> None:
         """Writes values [H, W] of a frame."""
         if self.tiff:
@@ -402,6 +408,12 @@ def write_shot(
                 files.add_picture(f"_{one.name}", stem, _with(panels[-1], limits), title, moving=False)
             files.add_figure(stem, panels, "   ".join([title, *limits]))
     _write_table(files.add("frames.csv"), rows)
+    if left := files.of_others():
+        log.warning(
+            "%s in %s is left of an earlier command, such as %s: not of this checkpoint, these settings or these frames; delete "
+            "what is not wanted, or give another folder with hydra.run.dir",
+            *(counted(len(left), "file"), files.folder, left[0].relative_to(files.folder)),
+        )
     return files.written
 
 

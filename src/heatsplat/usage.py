@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 import re
 import textwrap
-from argparse import ArgumentParser
 from collections.abc import Sequence
 from pathlib import Path
 
 from heatsplat.composition import CONF
+from heatsplat.io.command_lines import config_dirs
 
 # Groups of which the settings are explained for these options, "*" for all.
 EXPLAINED = {
@@ -32,7 +32,7 @@ def usage(command: str, doc: str, arguments: Sequence[str] = ()) -> str:
         arguments: of the command line, of which --config-dir is a further folder of configurations, and study=NAME the study
             whose settings are asked for.
     """
-    places = [Path(CONF), *_given(arguments)]
+    places = [Path(CONF), *config_dirs(arguments)[0]]
     text = (places[0] / f"{command}.yaml").read_text(encoding="utf-8")
     own, *_ = re.split(r"^(?:hydra:|\w+: +# internal)", text, maxsplit=1, flags=re.MULTILINE)
     lines = [doc.partition("\n")[0], "", *_explained(own)]
@@ -59,14 +59,6 @@ def usage(command: str, doc: str, arguments: Sequence[str] = ()) -> str:
         "With --cfg job, a command lists all its settings with the values that they would have, and runs nothing.",
     ]
     return re.sub("\n{3,}", "\n\n", "\n".join(lines))
-
-
-def _given(arguments: Sequence[str]) -> list[Path]:
-    """The folders that Hydra's --config-dir names."""
-    parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--config-dir", "-cd", type=Path)
-    folder = parser.parse_known_args([*arguments])[0].config_dir
-    return [] if folder is None else [folder.expanduser()]
 
 
 def _options(places: Sequence[Path], group: str, pattern: str = "*") -> dict[str, Path]:

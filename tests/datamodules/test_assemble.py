@@ -327,16 +327,18 @@ def pseudo_colour(index):
     return np.ascontiguousarray(cv2.applyColorMap(grey(index), cv2.COLORMAP_INFERNO)[..., ::-1])
 
 
-def test_pseudo_colour_is_no_temperature():
+def test_pseudo_colour_is_no_temperature(caplog):
     images = [pseudo_colour(i) for i in range(9)]
     with pytest.raises(SceneError, match=r"image 0\d\d.png of scene s is pseudo-colour.*data.thermal_channels=3"):
         scene_of(images, thermal_range=ThermalRange(0, 1))
     colour = scene_of(images, thermal_range=ThermalRange(0, 1), thermal_channels=3)
     assert colour.thermal_range is None and "bounds_ignored" in colour.notes
     np.testing.assert_allclose(colour.train[0].thermal, images[1] / 255.0, atol=1e-6)
+    assert "pseudo-colour" not in caplog.text
     luma = scene_of(images)
     assert luma.train[0].thermal.shape == (HEIGHT, WIDTH, 1)
     assert "luma" in luma.notes["pseudo_colour"]
+    assert "9 images in pseudo-colour" in caplog.text and "data.thermal_channels=3" in caplog.text
 
 
 def test_grey_images_fill_three_channels():

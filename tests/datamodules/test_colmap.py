@@ -1,4 +1,5 @@
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +50,55 @@ def test_cameras_points_and_pixels_come_back(tmp_path, text, place):
     assert scene.points.shape == (30, 3) and scene.point_colors.max() == pytest.approx(128 / 255)
     assert (scene.thermal_range.min_c, scene.thermal_range.max_c) == (10, 40)
     json.dumps(scene.notes)  # the report writes them
+
+
+@pytest.mark.parametrize("place", ["thermal/", "C:\\Flüge\\", "/home/me/"])
+def test_images_of_a_model_that_names_other_folders_are_known_by_their_files(tmp_path, place, caplog):
+    """As tools write it that name whole paths of the computer on which they ran."""
+    files = names(9)
+    write_colmap(tmp_path, files)
+    expected = {view.frame.name: view.camera.viewmat for view in loaded(tmp_path).train}
+    write_colmap(tmp_path / "other", [place + file for file in files], images=None, text=True)
+    shutil.rmtree(tmp_path / "sparse")
+    shutil.move(tmp_path / "other" / "sparse", tmp_path / "sparse")
+    with caplog.at_level("INFO"):
+        scene = loaded(tmp_path)
+    assert "known by the names of their files" in caplog.text
+    assert {view.frame.name: view.camera.viewmat for view in scene.train}.keys() == expected.keys()
+    for view in scene.train:
+        np.testing.assert_allclose(view.camera.viewmat, expected[view.frame.name], atol=1e-9)
+
+
+def test_two_cameras_of_a_model_in_folders_of_their_own_are_not_taken_for_each_other(tmp_path):
+    write_colmap(tmp_path, ["thermal/a.png", "thermal/b.png", "visible/a.png", "visible/b.png"])
+    for file in ("a.png", "b.png"):
+        shutil.move(tmp_path / "images" / "thermal" / file, tmp_path / "images" / file)
+    shutil.rmtree(tmp_path / "images" / "visible")
+    with pytest.raises(
+        SceneError, match="none of the 4 images .* has names like 'thermal/a.png', the folder like 'a.png'"
+    ):
+        loaded(tmp_path)
+
+
+def test_where_images_lie_is_told_where_their_folder_is_not_there(tmp_path):
+    write_colmap(tmp_path, names(3), images="thermal")
+    with pytest.raises(SceneError, match="data.images=images: .*/images does not exist; images lie in thermal/$"):
+        loaded(tmp_path)
+    assert loaded(tmp_path, images="thermal").train
+
+
+def test_what_is_nearly_a_model_is_told(tmp_path):
+    write_colmap(tmp_path / "s", names(3))
+    (tmp_path / "s" / "sparse" / "0").rename(tmp_path / "s" / "sparse" / "1")
+    for options in ({}, {"scene": "s"}):
+        with pytest.raises(SceneError, match="sparse/1 is a model: rename it to sparse/0"):
+            loaded(tmp_path if options else tmp_path / "s", **options)
+    (tmp_path / "s" / "sparse" / "1").rename(tmp_path / "s" / "sparse" / "0")
+    (tmp_path / "s" / "sparse" / "0" / "cameras.bin").unlink()
+    with pytest.raises(
+        SceneError, match="sparse/0 has images, and neither cameras.bin nor cameras.txt: copy the model"
+    ):
+        loaded(tmp_path / "s")
 
 
 @pytest.mark.parametrize("text", [False, True])

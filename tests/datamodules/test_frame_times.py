@@ -70,6 +70,22 @@ def test_names_with_the_time_of_day_go_on_past_midnight(tmp_path, form, late, ea
     assert abs(max(times.values()) - min(times.values()) - 7080.0) < 1e-6 and "midnight" not in note
 
 
+def test_a_table_takes_the_form_of_its_times(folder):
+    """As spreadsheets write them: a German date, and times of day around midnight."""
+    (folder / "sheet.csv").write_text(
+        "file;day;clock\r\na_010.png;06.08.2024 23:59:30;23:59:30\r\na_020.png;07.08.2024 00:01:00;00:01:00\r\n"
+    )
+    for column, form in (("day", "%d.%m.%Y %H:%M:%S"), ("clock", "%H:%M:%S")):
+        given = {"time_csv": "sheet.csv", "time_csv_time": column}
+        times, note = FrameTimes(**given, time_format=form).of(folder, NAMES)
+        assert times["a_020.png"] - times["a_010.png"] == 90.0
+        assert note == f"sheet.csv, column {column}" + "; 24 h were added to those after midnight" * (column == "clock")
+        with pytest.raises(SceneError, match="line 2: .* is neither seconds nor .* data.time_format=%H:%M:%S"):
+            FrameTimes(**given).of(folder, NAMES)
+        with pytest.raises(SceneError, match="line 2: .* is no time of the form HHMMSSmmm"):
+            FrameTimes(**given, time_format="HHMMSSmmm").of(folder, NAMES)
+
+
 def test_names_with_a_date_are_not_moved(tmp_path):
     told = FrameTimes(time_regex=r"_(\d+)", time_format="%Y%m%d%H%M")
     times, note = told.of(tmp_path, names := ["a_202408060001.png", "b_202408062359.png"])

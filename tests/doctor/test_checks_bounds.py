@@ -74,6 +74,17 @@ def test_greys_that_are_kelvin_x_100_are_found():
     assert greys(0.0, 65535.0) == greys(12000.0, 13500.0) == greys(28500.0, 31500.0, stored="grey8") == []
 
 
+def test_kelvin_x_100_between_bounds_are_not_told_to_narrow_them():
+    """They would all be told to have about the middle of the bounds."""
+    images = (30000.0 + 2000.0 * clean().images.clamp(0, 1).double()) / 65535  # 26.85 .. 46.85 °C
+    seen = replace(clean(), images=images, unit_k=30.0, bounds_c=(23.0, 53.0), clipped=None, stored="grey16")
+    (found,) = findings_of(seen, "bounds")
+    assert "kelvin x 100" in found.what and "bounds 23 .. 53 °C" in found.what and "are taken for 36.7" in found.what
+    assert "data.raw_scale=0.01" in found.remedy and found.cost > 0.5
+    (other,) = findings_of(replace(seen, bounds_c=(100.0, 130.0)), "bounds")  # greys in earnest
+    assert "kelvin" not in other.what and "Narrow the bounds" in other.remedy
+
+
 def test_bounds_that_cut_off_are_not_to_be_narrowed():
     found = findings_of(changed(clean(), 0.02 * clean().images, clipped=0.9), "bounds")
     assert [one.remedy.split()[1] for one in found] == ["wider"]

@@ -45,7 +45,7 @@ ALLOWED = {
     "viewer": {"contracts", "export", "io"},
     "composition": {"io", "training", "heatsplat"},
     "explanations": {"composition", "errors", "io"},
-    "usage": {"composition"},
+    "usage": {"composition", "io"},
     "doctor": {"contracts", "effects", "geometry", "io", "physics"},
     "runs": {
         "contracts",

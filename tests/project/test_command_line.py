@@ -262,6 +262,8 @@ def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path, 
         (("method=etgs", "data=rhd", "data.root=/nowhere/at/all"), "/nowhere/at/all"),
         (("method=3dgs", "ckpt=/nowhere/last.ckpt"), "no checkpoint at /nowhere/last.ckpt"),
         (("method=3dgs", "data.split=every_9th"), "every_9th"),
+        (("method=etgs", "hydra.sweeper.rows={eight:{set:['thermal.frequencies=8']}}"), "a single run: add -m"),
+        (("method=etgs", "ckpt=[a,b]"), "ckpt must be"),
     ],
 )
 def test_bad_input_is_named_with_exit_code_one(overrides, message, tmp_path, told):
@@ -379,11 +381,25 @@ def test_a_command_without_arguments_shows_how_it_is_used_and_trains_nothing(tmp
         ("data.root=/data/Flug über Köln, 2. Tag", "\"data.root='/data/Flug über Köln, 2. Tag'\""),
         ("data.root=/data/flight,2", "\"data.root='/data/flight,2'\""),
         ("data.ambient_c=20,5", "data.ambient_c=20.5"),
+        ("data.bounds_c=20,30", "two numbers have brackets: data.bounds_c=[20,30]"),
     ],
 )
 def test_typing_errors_get_a_suggestion(wrong, meant, tmp_path, told):
     output = told("train", "seed=1", wrong, cwd=tmp_path, code=1)
     assert meant in output and "Traceback" not in output
+
+
+def test_typing_errors_in_settings_of_a_further_folder_get_a_suggestion(tmp_path, told):
+    (tmp_path / "it's a conf" / "thermal").mkdir(parents=True)
+    (tmp_path / "it's a conf" / "thermal" / "mine.yaml").write_text("_target_: mine.Heat\ngain: 1.0\n")
+    folder = f"--config-dir={tmp_path}/it's a conf"
+    output = told("train", folder, "method=3dgs", "thermal=mine", "thermal.gian=2", cwd=tmp_path, code=1)
+    assert "Did you mean thermal.gain?" in output and "To append" not in output
+
+
+def test_a_view_of_several_checkpoints_is_refused_with_a_sentence(tmp_path, told):
+    output = told("view", "ckpt=[a,b]", cwd=tmp_path, code=1)
+    assert output.strip() == "ckpt must be one checkpoint or the folder of one run, got ['a', 'b']"
 
 
 def test_a_setting_of_another_command_is_not_offered_to_be_added(tmp_path, told):
@@ -536,5 +552,7 @@ def test_results_stay_those_of_their_settings(finished, told):
     before = {path: path.read_bytes() for path in (finished / ".hydra").iterdir()}
     others = ("optim.means=1e-3", f"hydra.run.dir={finished}")
     assert "other settings (optim.means)" in told("train", "method=etgs", *TINY, *others, cwd=finished, code=1)
+    longer = ("max_steps=21", f"hydra.run.dir={finished}")  # whose density control and schedules differ as well
+    assert "other settings (max_steps, " in told("train", "method=etgs", *TINY, *longer, cwd=finished, code=1)
     assert len(before) == 3 and before == {path: path.read_bytes() for path in (finished / ".hydra").iterdir()}
     assert not (finished / "FAILED").exists()

@@ -27,6 +27,7 @@ MADE_ON_A_PAGE = (
     "renderer=cropped",
     "callbacks=warmest",
     "callbacks=rmse",
+    "ablation=linear_drift_parts",
     "thermal=my_drift",
     "data=my_flight",
 )

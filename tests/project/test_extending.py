@@ -1,5 +1,6 @@
 """docs/extending.md, followed literally in a copy of the repository."""
 
+import itertools
 import json
 import re
 import shutil
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import in_turn
+from omegaconf import OmegaConf
 from running import TINY
 
 import heatsplat
@@ -107,6 +109,18 @@ def test_parts_outside_of_the_repository_are_trained_and_loaded(tmp_path, monkey
     heatsplat.train(config, tmp_path / "run")
     trained = heatsplat.load(tmp_path / "run" / "checkpoints" / "last.ckpt", trust=["my_heat.LinearDrift"])
     assert type(trained.module.thermal).__name__ == "LinearDrift"
+
+
+def test_its_ablation_is_a_sweep_of_rows_that_differ(tmp_path):
+    content = dict(FILES)
+    for name in ("thermal/linear_drift", "method/linear_drift", "ablation/linear_drift_parts"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / f"{name}.yaml").write_text(content[f"conf/{name}.yaml"])
+    written = OmegaConf.load(tmp_path / "ablation" / "linear_drift_parts.yaml").hydra
+    assert written.mode == "MULTIRUN" and written.sweeper.of == "linear_drift"
+    given = [f"hydra.searchpath=[{tmp_path}]", "ablation=linear_drift_parts"]
+    models = [heatsplat.compose([*given, *row.set])["thermal"] for row in written.sweeper.rows.values()]
+    assert len(models) == 3 and all(one != other for one, other in itertools.combinations(models, 2))
 
 
 def test_its_data_set_loads(results):

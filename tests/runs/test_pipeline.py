@@ -118,7 +118,7 @@ def test_a_step_changes_no_configuration_that_it_is_given(trained):
 
 def test_results_of_other_settings_are_not_taken_for_those_of_this_run(trained):
     folder, config, _ = trained
-    with pytest.raises(OccupiedError, match=r"other settings \(data.seed, seed\)"):
+    with pytest.raises(OccupiedError, match=r"other settings \(seed, data.seed\)"):
         heatsplat.train(heatsplat.compose([*QUICK, "seed=7"]), folder)
     with pytest.raises(OccupiedError, match=r"other settings \([^,]+(, [^,]+){4} and \d+ more\): give another folder"):
         heatsplat.train(heatsplat.compose([*QUICK, "method=energy_balance"]), folder)

@@ -274,7 +274,7 @@ def test_attributes_follow_the_assumed_emissivity_by_one_common_factor():
 
 
 def test_scenes_and_moments_that_cannot_be_answered_are_refused():
-    with pytest.raises(SceneError, match="EnergyBalance needs weather"):
+    with pytest.raises(SceneError, match="EnergyBalance needs .*weather by weather.csv of data=thermo"):
         ready(replace(scene(), weather=None))
     with pytest.raises(SceneError, match="EnergyBalance needs thermal_range"):
         ready(scene(thermal_range=None))

@@ -250,7 +250,7 @@ def test_one_moment_leaves_relaxation_and_says_so(times, caplog):
 def test_a_scene_without_times_is_refused():
     model = NewtonHarmonic()
     with pytest.raises(
-        SceneError, match="NewtonHarmonic needs time, which scene 'kettle' does not have .*, times by data.time_csv or"
+        SceneError, match="NewtonHarmonic needs time, which scene 'kettle' does not have .*: time by data.time_csv or"
     ):
         model.check(scene([0.0, None, 2.0]))
     with pytest.raises(SceneError, match="needs time"):

@@ -116,6 +116,7 @@ def test_published_and_drawn_gaussians_start_as_faint_balls_and_those_of_a_balan
         ("level", lambda n: PerGaussian(torch.zeros(3), 0.1), r"one row for each Gaussian, got torch.float32 \[3\]"),
         ("level", lambda n: PerGaussian(torch.full((n,), math.nan), 0.1), r"'level' .* from \d+ values that are NaN"),
         ("level", lambda n: PerGaussian(torch.zeros(n), -1e-3), "'level' .* has a learning rate of -0.001"),
+        ("level", lambda n: PerGaussian(torch.zeros(n), "fast"), "'level' .* has a learning rate of fast"),
     ],
 )
 def test_declared_tensors_of_another_kind_are_named(parts, name, item, told):

@@ -92,19 +92,21 @@ def test_a_run_without_any_part_has_none_of_them(tmp_path):
     assert terms == {"loss/total", "loss/thermal/l1", "loss/thermal/dssim", "loss/rgb/l1", "loss/rgb/dssim"}
 
 
-@pytest.mark.parametrize(("kept", "told"), [(0, "16 of the views"), (5, "11 of the views")])
+@pytest.mark.parametrize(("kept", "told"), [(0, "16 of the views"), (5, "11 of the views"), (None, "19 of the views")])
 def test_views_without_colour_are_refused_before_training(tmp_path, monkeypatch, kept, told):
-    """None of the 16 training views has a colour image, or not every one."""
+    """None of the 16 training views has a colour image, or not every one, or none of these and of the 3 test views."""
     from heatsplat.datamodules.synthetic import Synthetic
 
     loaded = Synthetic.load
 
     def colourless(views: ViewSet) -> ViewSet:
-        return ViewSet(views.frames, lambda i: views[i] if i < kept else replace(views[i], rgb=None))
+        return ViewSet(views.frames, lambda i: views[i] if i < (kept or 0) else replace(views[i], rgb=None))
 
     def without_colour(self):
         scene = loaded(self)
-        return replace(scene, train=colourless(scene.train))
+        test = ViewSet(scene.test.frames, lambda i: replace(scene.test[i], rgb=None))
+        held_out = {"test": test, "val": test} if kept is None else {}  # as of scenes of files: the same views
+        return replace(scene, train=colourless(scene.train), **held_out)
 
     monkeypatch.setattr(Synthetic, "load", without_colour)
     message = f"Radiative explains rgb images too, but {told} of scene 'glass' have none, frame_.* first. Give each"

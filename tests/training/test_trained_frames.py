@@ -139,6 +139,19 @@ def test_training_does_not_go_on_with_other_images(ckpt, tmp_path):
     assert trainer.global_step == 6
 
 
+def test_data_that_were_moved_are_asked_for(ckpt, tmp_path):
+    data = ckpt.parents[2] / "data"
+    moved = data.rename(tmp_path / "elsewhere")
+    try:
+        with pytest.raises(
+            SceneError, match="last.ckpt: its data are not at data.root=.*/data any more; .* data.root=FOLDER"
+        ):
+            load(ckpt)
+        assert load(ckpt, {"root": str(moved)}).scene.name == "elsewhere"
+    finally:
+        moved.rename(data)
+
+
 def test_a_checkpoint_that_does_not_tell_its_frames_loads(ckpt, tmp_path):
     stored = load_checkpoint(ckpt)
     stored["heatsplat"]["scales"].pop("frames")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import shlex
+from argparse import ArgumentParser
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 # Text that Hydra's grammar takes as it stands; it gives "=", ",", spaces, brackets and letters beyond ASCII a meaning or none.
@@ -40,6 +42,14 @@ def typed(argument: str) -> str:
     if re.fullmatch(r"[\w./=-]+", argument, re.ASCII):
         return argument
     return shlex.quote(argument) if re.search(r'[$`"\\!]', argument) else f'"{argument}"'
+
+
+def config_dirs(arguments: Iterable[str]) -> tuple[list[Path], list[str]]:
+    """The folders that Hydra's --config-dir names on a command line, and its other arguments."""
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config-dir", "-cd", type=Path)
+    found, others = parser.parse_known_args([*arguments])
+    return [] if found.config_dir is None else [found.config_dir.expanduser()], others
 
 
 def with_names(overrides: Iterable[str]) -> list[str]:

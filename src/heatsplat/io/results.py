@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,13 @@ SECTIONS = ("run", "test", "cost", "effects", "data", "versions", "definitions")
 
 
 def checkpoint_of(path: str | Path) -> Path:
-    """The file that a checkpoint's path means: the last checkpoint where it is a run's folder, or its folder of checkpoints."""
+    """The file that a checkpoint's path means: the last checkpoint where it is a run's folder, or its folder of checkpoints.
+
+    Raises:
+        ValueError: it is no path, such as a list of several.
+    """
+    if not isinstance(path, str | PathLike):
+        raise ValueError(f"ckpt must be one checkpoint or the folder of one run, got {path}")
     path = Path(path).expanduser()
     lasts = (path / LAST_CHECKPOINT, path / LAST_CHECKPOINT.name)
     return next((last for last in lasts if last.is_file()), path)

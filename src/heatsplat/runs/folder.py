@@ -10,7 +10,15 @@ from heatsplat.io.recorded import OVERRIDES, overrides_of
 from heatsplat.io.results import METRICS_FILE, RunResults
 from heatsplat.runs.checks import checked
 from heatsplat.runs.lock import OccupiedError
-from heatsplat.runs.resume import checkpoints_in, differences, learned_by, new_in, shortened, stored_config
+from heatsplat.runs.resume import (
+    checkpoints_in,
+    differences,
+    given_first,
+    learned_by,
+    new_in,
+    shortened,
+    stored_config,
+)
 
 
 def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
@@ -26,7 +34,11 @@ def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
         return None
     _, newest = next(checkpoints_in(folder), (None, {}))
     stored = stored_config(newest)
-    changed = differences(checked(config), stored) if stored else _given_otherwise(folder, config)
+    changed = (
+        given_first(differences(checked(config), stored), config, stored)
+        if stored
+        else _given_otherwise(folder, config)
+    )
     if stored and changed and len(new_in(config, stored, changed)) == len(changed):
         raise OccupiedError(
             f"{folder} holds the results of an older heatsplat, which did not have {shortened(changed)}: give another folder "

@@ -11,7 +11,7 @@ from typing import Any
 from heatsplat.composition import compose, followed, overlap, run_of
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.effects import assembly
-from heatsplat.io.command_lines import keys_of, setting, typed
+from heatsplat.io.command_lines import as_dict, keys_of, setting, typed
 from heatsplat.io.results import checkpoint_of
 from heatsplat.io.settings import at
 from heatsplat.runs.lock import OccupiedError
@@ -157,6 +157,14 @@ def learned_by(overrides: Mapping[str, str]) -> dict[str, str]:
     return {key: value for key, value in overrides.items() if says_it(key)}
 
 
+def given_first(changed: Sequence[str], config: Mapping[str, Any], stored: Mapping[str, Any]) -> list[str]:
+    """Settings in which two configurations differ, those first that a command line gave to one of them otherwise: numbers that
+    follow from those, such as steps of density control from max_steps, come after."""
+    now, before = (learned_by(as_dict(one.get("overrides") or [])) for one in (config, stored))
+    given = {key.lstrip("+~") for key in now.keys() | before.keys() if now.get(key) != before.get(key)}
+    return sorted(changed, key=lambda key: not any(overlap(key, other) for other in given))
+
+
 def shortened(names: Sequence[str]) -> str:
     """Names of settings for a message: the first, and how many more there are."""
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
@@ -165,9 +173,10 @@ def shortened(names: Sequence[str]) -> str:
 
 def _check_own(config: dict[str, Any], output_dir: Path, path: Path, checkpoint: Mapping[str, Any]) -> None:
     """Raises OccupiedError where a checkpoint in a run's folder is of other settings."""
-    if changed := differences(config, stored_config(checkpoint)):
+    stored = stored_config(checkpoint)
+    if changed := given_first(differences(config, stored), config, stored):
         step, ckpt = checkpoint.get("global_step"), typed(setting("ckpt", path))
-        if len(new_in(config, stored_config(checkpoint), changed)) == len(changed):
+        if len(new_in(config, stored, changed)) == len(changed):
             raise OccupiedError(
                 f"{output_dir} holds an unfinished run of an older heatsplat, which did not have "
                 f"{shortened(changed)}: {ckpt} {typed(setting('hydra.run.dir', output_dir))} goes on from step {step}, and they "

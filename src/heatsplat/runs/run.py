@@ -318,6 +318,12 @@ def load(
             "does, or leave weather out."
         )
     scene_data = build(config["data"] | changed)
+    trained_on = config["data"].get("root")
+    if trained_on is not None and "root" not in changed and not Path(trained_on).expanduser().exists():
+        raise SceneError(
+            f"{checkpoint}: its data are not at data.root={trained_on} any more; if they were moved, give the folder where they "
+            "are now, data.root=FOLDER"
+        )
     if weather is not None:
         scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
     with _naming(checkpoint, changed):

@@ -18,7 +18,13 @@ NORMALS = "normals"  # the tensor that ``surface_normals`` declares
 # Tensors that training fills where a model declares them, and new Gaussians inherit: shares [N, D] of the sun from the D
 # directions of ``geometry.exposure.sun_directions``, and [N] of the sky (heatsplat.training.exposure).
 SUN_SEEN, SKY_SEEN = "sun_seen", "sky_seen"
-TIMES = ", times by data.time_csv or data.time_regex (docs/your_own_data.md)"
+GIVEN_BY = {  # metadata: what gives it to a scene of one's own
+    "ambient": "data.ambient_c",
+    "metres": "data.metres_per_unit",
+    "thermal_range": "data.bounds_c or temperature_bounds.json",
+    "time": "data.time_csv or data.time_regex",
+    "weather": "weather.csv of data=thermo",
+}
 KELVIN_RANGE = 0.01  # K; float32 holds 300 K to 3e-5 K, a three-hundredth of it. Cameras have noise of 0.03 K and more.
 
 
@@ -175,10 +181,12 @@ class Heat(nn.Module, ABC):
             check_option(f"each of {type(self).__name__}.needs", name, METADATA)
         missing = sorted(self.needs - scene.metadata)
         if missing:
+            given = [f"{name} by {GIVEN_BY[name]}" for name in missing if name in GIVEN_BY]
+            how = f": {', '.join(given)} (docs/your_own_data.md)" if given else ""
             raise SceneError(
                 f"{type(self).__name__} needs {', '.join(missing)}, which scene '{scene.name}' does not have "
                 f"(it has: {', '.join(sorted(scene.metadata)) or 'images only'}). Choose a method that does without, "
-                f"or give the data set the missing metadata{TIMES if 'time' in missing else ''}."
+                f"or give the data set the missing metadata{how}."
             )
         if scene.thermal_range is not None and scene.thermal_range.span_k < self.narrowest_range_k:
             raise SceneError(
@@ -293,11 +301,13 @@ class ThermalModel(Heat):
         super().check(scene)
         for modality in self.companions:
             parts = scene.train, scene.val, scene.test
-            without = [view.frame.name for part in parts for view in part if getattr(view, modality) is None]
+            without = {  # by their names, as validation views are test views, too
+                view.frame.name: None for part in parts for view in part if getattr(view, modality) is None
+            }
             if without:
                 raise SceneError(
                     f"{type(self).__name__} explains {modality} images too, but {len(without)} of the views of "
-                    f"scene '{scene.name}' have none, {without[0]} first. Give each thermal image its {modality} image "
+                    f"scene '{scene.name}' have none, {next(iter(without))} first. Give each thermal image its {modality} image "
                     "(of the same name), or choose a method that explains thermal images alone."
                 )
 

@@ -344,7 +344,7 @@ def declared_by(thermal: ThermalModel, seeds: Seeds) -> dict[str, PerGaussian]:
             raise ValueError(f"{what} must start from floats [{count}, ...], one row for each Gaussian, got {shown}")
         if not bool(initial.isfinite().all()):
             raise ValueError(f"{what} starts from {int((~initial.isfinite()).sum())} values that are NaN or infinite")
-        if not 0 <= item.lr < float("inf"):
+        if not isinstance(item.lr, int | float) or not 0 <= item.lr < float("inf"):
             raise ValueError(f"{what} has a learning rate of {item.lr}, which must be 0 (not trained) or more")
     return declared
 

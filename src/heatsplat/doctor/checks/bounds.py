@@ -30,9 +30,10 @@ def find(material: Material) -> list[Finding]:
     values = torch.cat(sampled)
     if not len(values):
         return []
-    found = _of_unit(material, values) + _counts_as_greys(material, values)
+    counts = _counts_as_greys(material, values)
     cut_off = _cut_off(material, values)
-    found += cut_off or _unused(material, values)
+    # Narrower bounds would make other wrong temperatures of counts.
+    found = _of_unit(material, values) + counts + (cut_off or ([] if counts else _unused(material, values)))
     flat = [f for f, share in enumerate(plateaus) if share > PLATEAU]
     if len(flat) > 0.1 * len(material.images) and not cut_off:
         share = sum(plateaus[f] for f in flat) / len(flat)
@@ -158,20 +159,27 @@ def _shares_remedy(material: Material) -> str:
 
 
 def _counts_as_greys(material: Material, values: torch.Tensor) -> list[Finding]:
-    """Greys of 16 bits, no temperatures so far, that are rather kelvin x 100."""
-    if material.unit_k is not None or material.stored != "grey16":
+    """Greys of 16 bits, without temperatures or linear between given bounds, that are rather kelvin x 100."""
+    if material.stored != "grey16":
         return []
     ends = values.double().new_tensor([MIDDLE[0], 0.01, 0.5, 0.99, MIDDLE[1]])
     least, low, median, high, most = (FULL_16_BIT * _few(values).double().quantile(ends)).tolist()
     if most - least >= NARROW * FULL_16_BIT or not is_centikelvin(low, median, high):
         return []
     low_c, high_c = (CENTIKELVIN * end - KELVIN_AT_0_C for end in (least, most))
+    now = "are no temperatures so far"
+    if material.bounds_c is not None:
+        black, white = material.bounds_c
+        if high_c <= black or low_c >= white:  # bounds of other temperatures were not made for such counts
+            return []
+        between = [black + end / FULL_16_BIT * (white - black) for end in (least, most)]
+        now = f"are taken for {between[0]:.4g} .. {between[1]:.4g} °C, linear between the bounds {black:g} .. {white:g} °C"
     return [
         Finding(
             "bounds",
             0.9,
-            f"Greys of 16 bits use {100 * (most - least) / FULL_16_BIT:.1f} % of their range ({least:.0f} .. {most:.0f}) and are "
-            f"no temperatures so far; as kelvin x 100 they would be {low_c:.4g} .. {high_c:.4g} °C.",
+            f"Greys of 16 bits use {100 * (most - least) / FULL_16_BIT:.1f} % of their range ({least:.0f} .. {most:.0f}) and "
+            f"{now}; as kelvin x 100 they would be {low_c:.4g} .. {high_c:.4g} °C.",
             "If they are: data.raw=images data.raw_scale=0.01 with data=colmap (data.raw is the folder of the images), else "
             "python src/prepare.py source=IMAGES target=FOLDER poses=given poses.model=SCENE.",
         )
