@@ -20,6 +20,7 @@ from heatsplat.shots import (
     depth_beside,
     deviations_told,
     file_stems,
+    seconds_in,
     shot_frames,
     sightings,
     warn_beyond_record,
@@ -50,6 +51,26 @@ def test_unseen_pixels_are_nan_in_tiff_and_counted(tmp_path, caplog):
     (row,) = csv.DictReader((tmp_path / "frames.csv").open())
     assert float(row["seen_share"]) == pytest.approx(1 - 1 / height, abs=1e-4)
     assert "no training view has seen" in caplog.text
+
+
+def test_moments_may_be_dates_of_the_clock_that_the_scene_has():
+    """2024-08-07 09:00 UTC is second 0; the weather's clock is in UTC, and a camera's own has no zone that is known."""
+    noon = 1723021200.0
+    weather = make_scene()
+    weather = replace(weather, weather=replace(weather.weather, notes={"utc_at_zero_s": noon}))
+    camera = replace(weather, weather=None, notes={"clock_at_zero_s": noon})
+    for scene in (weather, camera):
+        assert seconds_in(scene, "2024-08-07T09:00") == [0.0] and seconds_in(scene, 7) == [7]
+        assert seconds_in(scene, ["2024-08-07 09:00:30.5", 60.0]) == [30.5, 60.0]
+        frames = shot_frames(scene, "view", ["2024-08-07T09:00", "2024-08-07T09:00:10"], 0, 3)
+        assert [frame.time_s for frame in frames] == [0, 5, 10]
+    assert seconds_in(weather, "2024-08-07T11:00:05+02:00") == [5.0]
+    with pytest.raises(SceneError, match="time=2024-08-07T11:00:00.02:00: nothing tells the time zone"):
+        seconds_in(camera, "2024-08-07T11:00+02:00")
+    with pytest.raises(SceneError, match="nothing tells which date .* give seconds since the first"):
+        seconds_in(replace(camera, notes={}), "2024-08-07T11:00")
+    with pytest.raises(SceneError, match="time=noon is neither a number of seconds nor a date-time, such as"):
+        shot_frames(camera, "view", "noon", 0, 1)
 
 
 def test_without_coverage_every_pixel_is_written(tmp_path, caplog):
@@ -288,10 +309,10 @@ def test_every_training_view_is_a_sighting_on_a_coarse_grid():
     ("settings", "told"),
     [
         ({"trajectory": "circle"}, "trajectory must be one of orbit, path, test, train, view, cameras, got 'circle'"),
-        ({"time": "abc"}, "time must be a number, got abc"),
+        ({"time": "abc"}, "time=abc is neither a number of seconds nor a date-time, such as 2024"),
         ({"time": float("nan")}, "time must be a number, got nan"),
         ({"time": []}, "time must be a number of seconds"),
-        ({"time": [0, 1, 2]}, r"time must be a number of seconds or \[start, end\], got \[0, 1, 2\]"),
+        ({"time": [0, 1, 2]}, r"time must be one moment or \[start, end\], got \[0, 1, 2\]"),
         ({"view": 1.9}, "view must be the whole number or the file name of a training frame, got 1.9"),
         ({"count": 1.5}, "frames must be a whole number, 1 or more, got 1.5"),
         ({"count": 0}, "frames must be a whole number, 1 or more, got 0"),

@@ -375,16 +375,17 @@ def simplify(config: dict[str, Any], output_dir: Path) -> None:
     from heatsplat.export.moment import moments_in
     from heatsplat.export.snapshot import span_of
     from heatsplat.runs.levels import write_levels
+    from heatsplat.shots import checked_times
 
     if HydraConfig.get().runtime.choices.merge == "none":
         raise SceneError("merge=none merges nothing: leave it out, or give merge=flat")
-    if config["time"] is not None:
-        check_numbers("time", config["time"], error=SceneError)
+    if config["time"] is not None and len(checked_times(config["time"])) > 1:
+        raise SceneError(f"time must be one moment, got {list(config['time'])}")
     trained = _load(config, output_dir)
     merging, write_ply = build(config["merge"]), None
     if config["ply"]:
         moments_in(trained.scene, span_of(trained.scene), config["time"])  # refused before a long search
-        write_ply = functools.partial(write_file, trained.module, Ply(), time_s=config["time"])
+        write_ply = functools.partial(write_file, trained.module, Ply(), time=config["time"])
     written = write_levels(trained, merging, config["levels_c"], output_dir, write_ply)
     log.info("%s in %s", counted(len(written), "file"), output_dir)
 

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -41,13 +42,14 @@ DEVIATION = "viridis"  # colours of what are no temperatures
 DEPTH_POINTS, DEPTH_ENDS, DEPTH_MARGIN = 1000, (0.02, 0.98), 0.1
 
 TRAJECTORIES = ("orbit", "path", "test", "train", "view", "cameras")
+Times = float | str | Sequence[float | str]  # seconds since the first training frame, or date-times; one or several
 UNSEEN = ("nan", "keep")  # what becomes of pixels that no training view has seen
 
 
 def shot_frames(
     scene: SceneData,
     trajectory: str = "orbit",
-    time: float | Sequence[float] | None = None,
+    time: Times | None = None,
     view: int | str = 0,
     count: int = 60,
     finer: int = 1,
@@ -59,9 +61,9 @@ def shot_frames(
         scene: whose cameras and record of time are meant.
         trajectory: "orbit" around the scene, "path" smoothly through given cameras or else those of training, "test" or "train"
             as taken, "view", one camera that stands still, or "cameras", those that are given.
-        time: seconds since the first training frame; [start, end] lets time pass over the shot; None takes the time of
-            each view (test, train), the whole record (view; for a single frame when the view was taken) or its middle (orbit,
-            path, and cameras without one); along a path through given cameras that have times it passes as theirs do.
+        time: seconds since the first training frame, or a date-time; [start, end] lets time pass over the shot; None takes the
+            time of each view (test, train), the whole record (view; for a single frame when the view was taken) or its middle
+            (orbit, path, and cameras without one); along a path through given cameras that have times it passes as theirs do.
         view: for "view": position among the training frames, or file name.
         count: frames of "orbit", "path" and "view".
         finer: how many of their pixels lie beside one of a training image (super-resolution); "test", "train" and "cameras" are
@@ -72,6 +74,7 @@ def shot_frames(
         SceneError: a setting that ``check_shot`` refuses, an unknown view, or no orbit where all cameras look along one line.
     """
     check_shot(trajectory, time, view, count)
+    time = None if time is None else seconds_in(scene, time)
     first_free = first_free_id(scene)
     if trajectory in ("test", "train"):
         taken = getattr(scene, trajectory).frames
@@ -89,15 +92,17 @@ def shot_frames(
         still = viewed(scene, view)
         shown, name = trajectories.fixed_view(still.camera, count), PurePosixPath(still.name)
         record = [t for t in scene.train.times_s if t is not None]
-        if time is None and record:
-            time = still.time_s if count == 1 else (min(record), max(record))
+        if time is None and count > 1 and record:
+            time = [min(record), max(record)]
+        elif time is None and still.time_s is not None:
+            time = [still.time_s]
     else:
         shown = _moving(scene, trajectory, count, cameras)
         own = [frame.time_s for frame in cameras] if trajectory == "path" else []
         if time is None and own and None not in own:
             # Equal shares of the frames between neighbours, as their places have.
             moments = np.interp(np.linspace(0, len(own) - 1, count), range(len(own)), own).tolist()
-        time = scene.middle_s if time is None else time
+        time = [scene.middle_s] if time is None and scene.middle_s is not None else time
     shown = [camera.resized(finer * camera.width, finer * camera.height) for camera in shown]
     moments = moments or ([None] * count if time is None else _moments(time, count))
     return [
@@ -106,24 +111,64 @@ def shot_frames(
     ]
 
 
-def check_shot(trajectory: str, time: float | Sequence[float] | None, view: int | str, count: int) -> None:
+def check_shot(trajectory: str, time: Times | None, view: int | str, count: int) -> None:
     """Raises SceneError where a setting of ``shot_frames`` is none, whatever the scene."""
     check_option("trajectory", trajectory, TRAJECTORIES, SceneError)
     if time is not None and len(checked_times(time)) > 2:
-        raise SceneError(f"time must be a number of seconds or [start, end], got {list(time)}")
+        raise SceneError(f"time must be one moment or [start, end], got {list(time)}")
     if not isinstance(view, int | str):
         raise SceneError(f"view must be the whole number or the file name of a training frame, got {view}")
     check_count("frames", count)
 
 
-def checked_times(time: float | Sequence[float]) -> list[float]:
-    """Moments in seconds that were given as one number or as a list. Raises SceneError where they are not, or there is none."""
+def checked_times(time: Times) -> list[float | datetime]:
+    """Moments that were given as one or as a list: seconds since the first training frame, or date-times (ISO 8601). Raises
+    SceneError where they are neither, or there is none."""
     listed = [*time] if isinstance(time, Sequence) and not isinstance(time, str) else [time]
-    for one in listed:
-        check_numbers("time", one, error=SceneError)
     if not listed:
         raise SceneError("time must be a number of seconds or a list of them, got []")
-    return listed
+    return [_date_time(one) if isinstance(one, str) else _number(one) for one in listed]
+
+
+def _number(time: float) -> float:
+    check_numbers("time", time, error=SceneError)
+    return time
+
+
+def _date_time(text: str) -> datetime:
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError:
+        raise SceneError(
+            f"time={text} is neither a number of seconds nor a date-time, such as 2024-08-07T09:12"
+        ) from None
+
+
+def seconds_in(scene: SceneData, time: Times) -> list[float]:
+    """Moments in seconds since the first training frame of a scene.
+
+    **Convention:** date-times are those of the scene's clock (``SceneData.clock_at_zero_s``), which reports and pictures show:
+    UTC where there is a weather record, unless they say another zone; else as the camera's clock showed them.
+
+    Raises:
+        SceneError: as ``checked_times``; or a date-time where nothing tells the clock, or with a zone where nothing tells its.
+    """
+    return [_second(scene, one) if isinstance(one, datetime) else one for one in checked_times(time)]
+
+
+def _second(scene: SceneData, moment: datetime) -> float:
+    zero_s = scene.clock_at_zero_s
+    if zero_s is None:
+        raise SceneError(
+            f"time={moment.isoformat()}: nothing tells which date the images of scene '{scene.name}' have; give seconds since "
+            "the first training frame"
+        )
+    if moment.tzinfo is not None and scene.weather is None:
+        raise SceneError(
+            f"time={moment.isoformat()}: nothing tells the time zone of the camera's clock of scene '{scene.name}'; give the "
+            "time as it showed it, without a zone"
+        )
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp() - zero_s
 
 
 def checked_unseen(name: str, value: str | float) -> str:
@@ -171,8 +216,7 @@ def viewed(scene: SceneData, view: int | str) -> Frame:
     return taken[int(view)]
 
 
-def _moments(time: float | Sequence[float], count: int) -> list[float]:
-    bounds = checked_times(time)
+def _moments(bounds: Sequence[float], count: int) -> list[float]:
     return np.linspace(bounds[0], bounds[-1], count).tolist()
 
 

@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from heatsplat.export.formats.base import Format
 from heatsplat.export.moment import Moment, moments, moments_in
 from heatsplat.export.snapshot import snapshot, span_of
+from heatsplat.shots import Times
 
 log = logging.getLogger("heatsplat")
 
 
-def write_files(
-    module: Any, form: Format, folder: Path, times: float | Sequence[float] | None = None, layer: str = "auto"
-) -> list[Path]:
+def write_files(module: Any, form: Format, folder: Path, times: Times | None = None, layer: str = "auto") -> list[Path]:
     """Paths of the files written, ``<scene>_<seconds>s<suffix>``; what they do not hold is warned of.
 
     Args:
         module: a training module with its scene (``training.scene_model.SceneModel``).
         form: the format.
         folder: of the files; it is made.
-        times: seconds since the first training frame, one or several; None takes ``SceneData.middle_s``.
+        times: seconds since the first training frame, or date-times, one or several; None takes ``SceneData.middle_s``.
         layer: as in ``export.moment.moments``.
 
     Raises:
@@ -40,13 +38,13 @@ def write_files(
     return written
 
 
-def write_file(module: Any, form: Format, path: Path, time_s: float | None = None) -> None:
+def write_file(module: Any, form: Format, path: Path, time: float | str | None = None) -> None:
     """As ``write_files``, one file at one moment."""
-    (moment,) = _moments(module, form, time_s, "auto")
+    (moment,) = _moments(module, form, time, "auto")
     form.write(moment, path)
 
 
-def _moments(module: Any, form: Format, times: float | Sequence[float] | None, layer: str) -> list[Moment]:
+def _moments(module: Any, form: Format, times: Times | None, layer: str) -> list[Moment]:
     """The moments that a format is to write; what their files will not hold is warned of."""
     moments_in(module.scene, span_of(module.scene), times)  # a snapshot may take a minute
     seen = snapshot(module)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,7 @@ from heatsplat.contracts import SceneData, SceneError, View, check_option
 from heatsplat.export.snapshot import Layer, Snapshot
 from heatsplat.geometry.coverage import OPEN, surface_depth
 from heatsplat.geometry.looks import Look
-from heatsplat.shots import checked_times
+from heatsplat.shots import Times, seconds_in
 
 LAYERS = ("auto", "camera", "surface", "truth")
 
@@ -65,20 +64,18 @@ class Moment:
         return Look(frame.camera, surface_depth(output.depth, alpha), self.of_blended(means))
 
 
-def moments_in(
-    scene: SceneData, span: tuple[float, float] | None, times: float | Sequence[float] | None
-) -> list[float | None]:
+def moments_in(scene: SceneData, span: tuple[float, float] | None, times: Times | None) -> list[float | None]:
     """Moments of a scene, [None] where nothing changes.
 
     Args:
         scene: with the training record.
         span: of time that can be asked for (``snapshot.span_of``).
-        times: seconds since the first training frame, one or several; None takes ``SceneData.middle_s``.
+        times: seconds since the first training frame, or date-times, one or several; None takes ``SceneData.middle_s``.
 
     Raises:
-        SceneError: a moment is no number or outside the span, or there is none.
+        SceneError: a moment is none (``shots.seconds_in``) or outside the span, or there is none.
     """
-    wanted = None if times is None else checked_times(times)
+    wanted = None if times is None else seconds_in(scene, times)
     if span is None:
         if wanted is not None:
             raise SceneError(f"time={times}: scene '{scene.name}' does not change in time; leave time out")
@@ -94,13 +91,13 @@ def moments_in(
     return wanted
 
 
-def moments(module: Any, seen: Snapshot, times: float | Sequence[float] | None, layer: str = "auto") -> list[Moment]:
+def moments(module: Any, seen: Snapshot, times: Times | None, layer: str = "auto") -> list[Moment]:
     """The Gaussians at each of some moments.
 
     Args:
         module: a training module with its scene.
         seen: its snapshot.
-        times: seconds since the first training frame, one or several; None takes ``SceneData.middle_s``.
+        times: seconds since the first training frame, or date-times, one or several; None takes ``SceneData.middle_s``.
         layer: "camera", "surface" or "truth" (``Layer.name``); "auto" is the surface where the model tells its temperature
             apart from what a camera gets, and the camera elsewhere.
 
