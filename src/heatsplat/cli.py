@@ -251,17 +251,18 @@ def train(config: dict[str, Any], output_dir: Path) -> float | None:
     with loading():
         from heatsplat.runs.run import train_in
 
-    if (chosen := HydraConfig.get().runtime.choices.study) is not None:
+    hydra = HydraConfig.get()
+    if (chosen := hydra.runtime.choices.study) is not None:
         raise SceneError(f"a study has a command of its own: python src/study.py study={chosen}")
-    launcher = HydraConfig.get().runtime.choices.launcher
-    if launcher not in (None, "basic") and HydraConfig.get().mode != RunMode.MULTIRUN:
+    sweep, launcher = hydra.mode == RunMode.MULTIRUN, hydra.runtime.choices.launcher
+    if launcher not in (None, "basic") and not sweep:
         log.warning("launcher=%s starts the jobs of a sweep; this single run trains right here: add -m", launcher)
-    if HydraConfig.get().sweeper.get("rows") and HydraConfig.get().mode != RunMode.MULTIRUN:
+    if hydra.sweeper.get("rows") and not sweep:
         raise SceneError(
             "the rows of an ablation (hydra.sweeper.rows) are jobs of a sweep, and this is a single run: add -m, or write mode: "
             "MULTIRUN below hydra: in the file of the ablation"
         )
-    if HydraConfig.get().mode == RunMode.MULTIRUN:
+    if sweep:
         clear_away()
     if (first := config.get("table", {}).get("after")) is not None:
         check_first(first)

@@ -211,7 +211,8 @@ def test_without_slurm_its_rehearsal_is_named(monkeypatch, tmp_path):
     [("slurm", RunMode.RUN, True), ("slurm", RunMode.MULTIRUN, False), ("basic", RunMode.RUN, False)],
 )
 def test_a_single_run_says_that_its_launcher_has_nothing_to_start(launcher, mode, told, monkeypatch, caplog, tmp_path):
-    hydra_config = OmegaConf.create({"mode": mode, "runtime": {"choices": {"study": None, "launcher": launcher}}})
+    choices = {"study": None, "launcher": launcher}
+    hydra_config = OmegaConf.create({"mode": mode, "runtime": {"choices": choices}, "sweeper": {}})
     monkeypatch.setattr(HydraConfig, "get", lambda: hydra_config)
     monkeypatch.setattr("heatsplat.runs.run.train_in", lambda *_: RunResults())
     with caplog.at_level("WARNING", logger="heatsplat"):
