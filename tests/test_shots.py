@@ -69,7 +69,7 @@ def test_moments_may_be_dates_of_the_clock_that_the_scene_has():
         seconds_in(camera, "2024-08-07T11:00+02:00")
     with pytest.raises(SceneError, match="nothing tells which date .* give seconds since the first"):
         seconds_in(replace(camera, notes={}), "2024-08-07T11:00")
-    with pytest.raises(SceneError, match="time=noon is neither a number of seconds nor a date-time, such as"):
+    with pytest.raises(SceneError, match="time must be a number of seconds or a date-time such as .* got noon"):
         shot_frames(camera, "view", "noon", 0, 1)
 
 
@@ -309,7 +309,7 @@ def test_every_training_view_is_a_sighting_on_a_coarse_grid():
     ("settings", "told"),
     [
         ({"trajectory": "circle"}, "trajectory must be one of orbit, path, test, train, view, cameras, got 'circle'"),
-        ({"time": "abc"}, "time=abc is neither a number of seconds nor a date-time, such as 2024"),
+        ({"time": "abc"}, "time must be a number of seconds or a date-time such as .* got abc"),
         ({"time": float("nan")}, "time must be a number, got nan"),
         ({"time": []}, "time must be a number of seconds"),
         ({"time": [0, 1, 2]}, r"time must be one moment or \[start, end\], got \[0, 1, 2\]"),

@@ -251,13 +251,13 @@ def train(config: dict[str, Any], output_dir: Path) -> float | None:
     with loading():
         from heatsplat.runs.run import train_in
 
-    hydra = HydraConfig.get()
-    if (chosen := hydra.runtime.choices.study) is not None:
+    started = HydraConfig.get()
+    if (chosen := started.runtime.choices.study) is not None:
         raise SceneError(f"a study has a command of its own: python src/study.py study={chosen}")
-    sweep, launcher = hydra.mode == RunMode.MULTIRUN, hydra.runtime.choices.launcher
+    sweep, launcher = started.mode == RunMode.MULTIRUN, started.runtime.choices.launcher
     if launcher not in (None, "basic") and not sweep:
         log.warning("launcher=%s starts the jobs of a sweep; this single run trains right here: add -m", launcher)
-    if hydra.sweeper.get("rows") and not sweep:
+    if started.sweeper.get("rows") and not sweep:
         raise SceneError(
             "the rows of an ablation (hydra.sweeper.rows) are jobs of a sweep, and this is a single run: add -m, or write mode: "
             "MULTIRUN below hydra: in the file of the ablation"

@@ -140,7 +140,7 @@ def _date_time(text: str) -> datetime:
         return datetime.fromisoformat(text)
     except ValueError:
         raise SceneError(
-            f"time={text} is neither a number of seconds nor a date-time, such as 2024-08-07T09:12"
+            f"time must be a number of seconds or a date-time such as 2024-08-07T09:12, got {text}"
         ) from None
 
 

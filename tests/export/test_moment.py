@@ -38,11 +38,16 @@ def test_several_moments_and_none_outside_the_record(cooling):
 
 
 @pytest.mark.parametrize(
-    ("times", "told"), [("abc", "=abc is neither"), ([1.0, "b"], "=b is neither"), (float("nan"), " must be a number, got nan"),
-                        ([], " must be a number of seconds or a list of them")],
-)  # fmt: skip
+    ("times", "told"),
+    [
+        ("abc", "must be .* got abc"),
+        ([1.0, "b"], "must be .* got b"),
+        (float("nan"), "must be a number, got nan"),
+        ([], "must be a number of seconds or a list of them"),
+    ],
+)
 def test_what_is_no_time_is_refused(cooling, times, told):
-    with pytest.raises(SceneError, match=f"time{told}"):
+    with pytest.raises(SceneError, match=f"time {told}"):
         moments(cooling.module, cooling.seen, times)
 
 

@@ -174,7 +174,7 @@ def test_a_sweep_over_a_checkpoint_stays_with_its_run(script, folder, tmp_path):
         ("fps=0", "fps must be above 0, got 0"),
         ("fps=abc", "fps must be a number, got abc"),
         ("frames=1.5", "frames must be a whole number"),
-        ("time=abc", "time must be a number, got abc"),
+        ("time=abc", "time must be a number of seconds or a date-time such as .*, got abc"),
         ("images=[]", "images must be all, or one or a list of recorded, clean and rgb"),
         ("images=3", "images must be all, or one or a list of recorded, clean and rgb, got 3"),
         ("unseen=show", "unseen must be one of nan, keep"),
