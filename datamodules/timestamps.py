@@ -109,7 +109,7 @@ def times_from_csv(path: Path, name_column: str, time_column: str, form: str | N
         form: strptime format of the times, or "HHMMSSmmm"; None for seconds and ISO 8601 date-times.
 
     Raises:
-        SceneError: no such column, a cell that is no such time, or two times of one file.
+        SceneError: no such column, a cell that is no such time, times of several clocks, or two times of one file.
     """
     table = read_table(path)
     for key, column in (("time_csv_name", name_column), ("time_csv_time", time_column)):
@@ -117,6 +117,7 @@ def times_from_csv(path: Path, name_column: str, time_column: str, form: str | N
             raise SceneError(f"data.{key}={column}: {path} has no such column; it has {', '.join(table.columns)}")
     name_at, time_at = table.columns.index(name_column), table.columns.index(time_column)
     times: dict[str, float] = {}
+    clocks: dict[str, tuple[int, str]] = {}
     for number, row in table.rows:
         cell = row[time_at]
         try:
@@ -131,11 +132,27 @@ def times_from_csv(path: Path, name_column: str, time_column: str, form: str | N
                     "\"data.time_format='%d.%m.%Y %H:%M:%S'\" or data.time_format=%H:%M:%S"
                 )
             raise SceneError(f"{path}, line {number}: {cell!r} in column {time_column} is {other}") from error
+        clocks.setdefault(_clock(table.pointed(cell)) if form is None else "", (number, cell))
+        if len(clocks) > 1:
+            (first, (above, other)), (second, _) = clocks.items()
+            raise SceneError(
+                f"{path}, line {number}: {cell!r} in column {time_column} is {second}, and {other!r} in line {above} is {first}; "
+                "hours may lie between the two: write all alike"
+            )
         if times.setdefault(row[name_at], seconds) != seconds:
             raise SceneError(
                 f"{path}, line {number}: {row[name_at]} has another time in a line above; keep one of them"
             )
     return times
+
+
+def _clock(text: str) -> str:
+    """What a time of ``seconds_of`` counts on, in words."""
+    try:
+        float(text)
+    except ValueError:
+        return f"a date-time {'with' if datetime.fromisoformat(text).tzinfo else 'without'} a time zone"
+    return "a number of seconds"
 
 
 def seconds_of(text: str) -> float:

@@ -76,6 +76,34 @@ def test_a_table_gives_seconds_or_dates(tmp_path):
     assert dates["A_2.png"] - dates["A_1"] == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("cells", "told"),
+    [
+        (
+            ("2024-08-06T15:35:05Z", "2024-08-06T15:36:05"),
+            "line 3: .*36:05' in column t is a date-time without a time zone, and",
+        ),
+        (
+            ("2024-08-06T15:35:05", "2024-08-06T15:36:05+02:00"),
+            "line 3: .* with a time zone, and .* line 2 is .* without",
+        ),
+        (("0.5", "2024-08-06T15:36:05"), "line 3: .* without a time zone, and '0.5' in line 2 is a number of seconds"),
+    ],
+)
+def test_a_table_has_one_clock(tmp_path, cells, told):
+    table = tmp_path / "times.csv"
+    table.write_text("file,t\n" + "\n".join(f"A_{i}.png,{cell}" for i, cell in enumerate(cells)))
+    with pytest.raises(SceneError, match=told):
+        times_from_csv(table, "file", "t")
+    assert len(times_from_csv(_alike(table, cells[0]), "file", "t")) == 2
+
+
+def _alike(table, cell):
+    """The table with one time in all rows."""
+    table.write_text(f"file,t\nA_0.png,{cell}\nA_1.png,{cell}")
+    return table
+
+
 def test_a_table_names_missing_columns_and_bad_cells(tmp_path):
     table = tmp_path / "t.csv"
     table.write_text("file,s\na,soon\n")
