@@ -24,7 +24,7 @@ def passed_by(share, size=0.2):
 @pytest.mark.parametrize("share", [0.25, 0.5])
 def test_points_that_something_passes_are_counted(share):
     found = share_of_points(fit_to(COOLING + passed_by(share)), RELAXATION)
-    assert found == pytest.approx(21 * share, rel=0.15) and found > EFFECT.threshold
+    assert found == pytest.approx(42 * share, rel=0.15) and found > EFFECT.threshold
 
 
 @pytest.mark.parametrize("values", [levels(), COOLING], ids=["at rest", "cooling"])
@@ -43,7 +43,7 @@ def test_points_of_which_as_many_cool_as_warm_are_misplaced_ones():
     either = torch.where(torch.arange(POINTS) % 2 == 0, 1.0, -1.0)[:, None]
     assert share_of_points(fit_to(COOLING + either * passed_by(0.5)), RELAXATION) < 0.5 * EFFECT.threshold
     cold = share_of_points(fit_to(COOLING - passed_by(0.5)), RELAXATION)  # greys may be dark where it is hot
-    assert cold == pytest.approx(21 * 0.5, rel=0.15)
+    assert cold == pytest.approx(42 * 0.5, rel=0.15)
 
 
 @pytest.mark.slow

@@ -19,12 +19,13 @@ FREE = 1e-3  # share of a course's length that a point's other numbers must leav
 
 
 def share_of_points(fit: Fit, model: Model) -> float:
-    """Share of the points that change by much at a moment of their own, and the same way, over the share that change by chance.
+    """Share of the points that change by much at a moment of their own, and the same way, over the share that do by chance.
 
     What a model leaves of a point's values is explained by one change at one moment that fades afterwards. It counts where it
     explains more than the best moment of every one of 20 shuffles of what is left; by chance 1 in 21 points does. Where images
     follow each other closely more do, as what a misplaced point shows goes on from image to image, too, in no order that a
-    shuffle keeps: that is warmer as often as colder, so points that change one way count against those that change the other.
+    shuffle keeps: that is warmer as often as colder, so points that change one way count against those that change the other,
+    and are compared with the half of those by chance that change their way.
 
     Args:
         fit: its outliers count here, for a point that something passes looks like one.
@@ -56,7 +57,7 @@ def share_of_points(fit: Fit, model: Model) -> float:
     shuffles = [_shuffled(left, seen, generator_for(0, k, "shuffled moments")) for k in range(SHUFFLES)]
     chance = torch.stack([explained(shuffled)[1] for shuffled in shuffles]).max(0).values
     large = found.square() > LARGE**2 * seen.sum(1)
-    return abs(float((found.sign() * (large & (part > chance))).mean())) * (SHUFFLES + 1)
+    return abs(float((found.sign() * (large & (part > chance))).mean())) * 2 * (SHUFFLES + 1)
 
 
 def _tamed(left: Tensor) -> Tensor:
