@@ -125,19 +125,19 @@ def times_from_csv(path: Path, name_column: str, time_column: str, form: str | N
             if not math.isfinite(seconds):
                 raise ValueError(cell)
         except ValueError as error:
-            other = f"no time of the form {form} (data.time_format; null takes seconds and ISO date-times)"
+            what = f"no time of the form {form} (data.time_format; null takes seconds and ISO date-times)"
             if form is None:
-                other = (
+                what = (
                     "neither seconds nor a date-time such as 2024-08-06T15:35:05.376; how others are written says "
                     "\"data.time_format='%d.%m.%Y %H:%M:%S'\" or data.time_format=%H:%M:%S"
                 )
-            raise SceneError(f"{path}, line {number}: {cell!r} in column {time_column} is {other}") from error
+            raise SceneError(f"{path}, line {number}: {cell!r} in column {time_column} is {what}") from error
         clocks.setdefault(_clock(table.pointed(cell)) if form is None else "", (number, cell))
         if len(clocks) > 1:
-            (first, (above, other)), (second, _) = clocks.items()
+            (first, (above, earlier)), (second, _) = clocks.items()
             raise SceneError(
-                f"{path}, line {number}: {cell!r} in column {time_column} is {second}, and {other!r} in line {above} is {first}; "
-                "hours may lie between the two: write all alike"
+                f"{path}, line {number}: {cell!r} in column {time_column} is {second}, and {earlier!r} in line {above} is "
+                f"{first}; hours may lie between the two: write all alike"
             )
         if times.setdefault(row[name_at], seconds) != seconds:
             raise SceneError(

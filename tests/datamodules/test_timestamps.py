@@ -95,13 +95,8 @@ def test_a_table_has_one_clock(tmp_path, cells, told):
     table.write_text("file,t\n" + "\n".join(f"A_{i}.png,{cell}" for i, cell in enumerate(cells)))
     with pytest.raises(SceneError, match=told):
         times_from_csv(table, "file", "t")
-    assert len(times_from_csv(_alike(table, cells[0]), "file", "t")) == 2
-
-
-def _alike(table, cell):
-    """The table with one time in all rows."""
-    table.write_text(f"file,t\nA_0.png,{cell}\nA_1.png,{cell}")
-    return table
+    table.write_text(f"file,t\nA_0.png,{cells[0]}\nA_1.png,{cells[0]}")
+    assert len(times_from_csv(table, "file", "t")) == 2
 
 
 def test_a_table_names_missing_columns_and_bad_cells(tmp_path):

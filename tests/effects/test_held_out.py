@@ -33,9 +33,9 @@ def test_what_is_there_gains_where_it_was_not_fitted_and_what_is_not_there_loses
 
 def test_frames_are_asked_for_only_where_they_would_be_looked_at():
     """Twice the standard errors take four times the frames; of a recording of any length 64 are looked at."""
-    assert would_tell(HeldOut(1.0, 2.0, 15), 4.0, 0.5) == "about 60 frames would tell"
+    assert would_tell(HeldOut(1.0, 2.0, 15), 4.0) == "about 60 frames would tell"
     for gain in (HeldOut(1.0, 2.0, 17), HeldOut(1.0, 2.0, 64), HeldOut(1.0, -3.0, 5)):
-        assert would_tell(gain, 4.0, 0.5) == "less noise would tell, for no more than 64 frames are looked at"
+        assert would_tell(gain, 4.0) == "less noise would tell, for no more than 64 frames are looked at"
 
 
 @pytest.mark.parametrize("together", [True, False])

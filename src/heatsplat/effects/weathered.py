@@ -14,7 +14,7 @@ from torch import Tensor
 from heatsplat.contracts import Weather
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Evidence
-from heatsplat.effects.joint.held_out import FOLDS, WORST, HeldOut, compared, fold_of, would_tell
+from heatsplat.effects.joint.held_out import CHANCE, FOLDS, WORST, HeldOut, compared, fold_of, would_tell
 from heatsplat.effects.observations import Tracks
 from heatsplat.geometry.exposure import lit_beside, sky_directions, sun_directions
 from heatsplat.geometry.rotations import reflected
@@ -26,8 +26,8 @@ from heatsplat.physics.wetness import FILM_MM, rained_on, wetted
 if TYPE_CHECKING:
     from heatsplat.effects.inspection import Inspection
 
-# Standard errors from which a gain on held-out observations is no chance, and below which it is; decibels that are none.
-SIGMAS, CHANCE = 3.0, 0.5
+# Standard errors from which a gain on held-out observations is no chance (below CHANCE it is); decibels that are none.
+SIGMAS = 3.0
 # Those of sun, sky and wind, which are there more often than not under the sky. A part that is absent loses on such observations:
 # of 32 that were in 38 scenes drawn at random one gained 2.8 standard errors, one 1.9, and the others 1.0 at most.
 PART_SIGMAS = 2.0
@@ -143,7 +143,7 @@ def weighed(
     if gain.sigmas > sigmas and not needed:  # more frames make it more certain, but no larger
         why = "cannot be told from what balances leave unexplained, for it is too small"
     else:
-        more_frames = f"{needed} would tell" if needed else would_tell(gain, sigmas, CHANCE)
+        more_frames = f"{needed} would tell" if needed else would_tell(gain, sigmas)
         why = f"cannot be told from {gain.images} frames, {more_frames}"
     return Evidence(gain.sigmas, f"{found}: {why}", told=False, gain_db=gain.db)
 

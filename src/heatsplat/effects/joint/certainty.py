@@ -22,7 +22,6 @@ from heatsplat.training.rng import generator_for
 
 # What an effect must bring on held-out observations: less is no loss, and within the scatter of the images it is chance.
 MIN_DB, MIN_SIGMAS = 0.3, 3.5
-CHANCE = 0.5  # standard errors that a gain counts at least where it is said how many frames would tell
 SHUFFLES, NO_CHANCE = 8, 30.0  # gains from which it is not asked whether chance makes as much
 # Nine tenths of the points in the most even third are explained to within so many times the expected error: nothing is left
 # for another effect. At edges poses err.
@@ -255,7 +254,7 @@ class Certainty:
             if not rule(fit, more, less):
                 return why
         if held_out.sigmas < MIN_SIGMAS and held_out.db > 0:
-            more_frames = would_tell(held_out, MIN_SIGMAS, CHANCE)
+            more_frames = would_tell(held_out, MIN_SIGMAS)
             return f"what it gains scatters over the images as much as chance would; {more_frames}"
         if held_out.db < MIN_DB:
             return f"{held_out.db:.1f} dB on what was left out are no gain; more frames, or less noise, would tell"

@@ -12,6 +12,7 @@ from heatsplat.effects.joint.fit import Fit
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.observations import MAX_FRAMES
 
+CHANCE = 0.5  # standard errors below which a gain is as good as none; it counts as so many where frames are asked for
 # Each fold leaves out a quarter: of every image one half of the points, together with the other half of the image after next.
 FOLDS = 4
 WORST = 25.0  # squares of the expected error that a missed observation counts at most
@@ -64,14 +65,10 @@ def shows(gain: HeldOut) -> bool:
     return gain.db > NOTHING_DB and gain.sigmas > NOTHING_SIGMAS
 
 
-def would_tell(gain: HeldOut, sigmas: float, chance: float) -> str:
+def would_tell(gain: HeldOut, sigmas: float) -> str:
     """Frames from which a gain that scatters as it does would be so many standard errors, in words; of a longer record no more
-    than MAX_FRAMES are looked at.
-
-    Args:
-        chance: standard errors that the gain counts at least.
-    """
-    needed = math.ceil(gain.images * (sigmas / max(gain.sigmas, chance)) ** 2)
+    than MAX_FRAMES are looked at."""
+    needed = math.ceil(gain.images * (sigmas / max(gain.sigmas, CHANCE)) ** 2)
     if needed > MAX_FRAMES:
         return f"less noise would tell, for no more than {MAX_FRAMES} frames are looked at"
     return f"about {needed} frames would tell"
