@@ -531,11 +531,11 @@ class Hours:
         slower: how much slower the steps of the run are than those of the calibration, which take ``STEP_S``.
     """
 
-    STEP_S = 0.02
+    STEP_S, WAITING = 0.02, 3  # others have the processor for two thirds of the time
 
     def __init__(self, monkeypatch, slower: float) -> None:
         self.now, self.slower, self.dies_at = 0.0, slower, None
-        for module in ("runs.stepping", "runs.budget", "callbacks.timing"):
+        for module in ("training.clocks", "callbacks.timing"):
             monkeypatch.setattr(f"heatsplat.{module}.time", self)
         monkeypatch.setattr(SplatTraining, "training_step", lambda module, *_: self.step(module))
         monkeypatch.setattr(SplatTraining, "on_after_backward", lambda _: None)
@@ -544,7 +544,7 @@ class Hours:
         return self.now
 
     def process_time(self) -> float:
-        return self.now
+        return self.now / self.WAITING
 
     def step(self, module: SplatTraining) -> dict:
         calibrates = not isinstance(module.trainer, pl.Trainer)
@@ -573,6 +573,37 @@ def test_whole_runs_end_within_a_tenth_of_their_time_whatever_the_calibration_sa
     assert abs(told["off_percent"]) < 3 and told["schedule_done"] > 0.95
     assert told["steps"] == module.trainer.global_step
     assert told["steps"] / told["planned_steps"] == pytest.approx(1.0 / slower, rel=0.1)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_seconds_of_a_busy_machine_may_be_those_of_the_processor(tmp_path, monkeypatch):
+    Hours(monkeypatch, 1.0)
+    module, _ = running.run(tmp_path / "busy", *BLIND, "budget_clock=cpu_seconds")
+    told, cost = module.results.run["budget"], module.results.cost
+    assert told["clock"] == "cpu_seconds" and cost["cpu_seconds"] + told["calibration_s"] == pytest.approx(
+        3.0, rel=0.03
+    )
+    assert cost["train_seconds"] == pytest.approx(Hours.WAITING * cost["cpu_seconds"])
+    planned = prepared(tmp_path / "wall")
+    assert planned["budget"]["clock"] == "train_seconds"
+    assert told["planned_steps"] / planned["budget"]["steps"] == pytest.approx(Hours.WAITING, rel=0.1)
+    leave(tmp_path / "stopped", planned, 50, 100.0)
+    with pytest.raises(OccupiedError, match=r"other settings \(budget_clock\)"):
+        prepared(tmp_path / "stopped", "budget_clock=cpu_seconds")
+
+
+def test_a_clock_without_a_budget_or_of_no_use_is_refused(tmp_path, monkeypatch):
+    for overrides, message in (
+        (("budget_clock=cpu_seconds", "budget=null"), "there is none: give budget=, or leave it out"),
+        (("budget_clock=wall",), "budget_clock must be one of train_seconds, cpu_seconds, got 'wall'"),
+    ):
+        with pytest.raises(SceneError, match=message):
+            prepared(tmp_path, *overrides)
+    monkeypatch.setattr("heatsplat.runs.checks.device_of", lambda *_: "cuda")
+    with pytest.raises(
+        SceneError, match="budget_clock=cpu_seconds counts processor time, and this run trains on a GPU"
+    ):
+        prepared(tmp_path, "budget_clock=cpu_seconds")
 
 
 @pytest.mark.filterwarnings("ignore")

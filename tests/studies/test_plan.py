@@ -42,6 +42,17 @@ def test_an_image_is_handed_in_behind_a_sensor_that_is_no_flaw_of_the_camera(tmp
         assert image.endswith(f"={found.image(method, scene)}")
 
 
+def test_equal_seconds_are_those_of_the_boards_clock(tmp_path):
+    root = protocol_folder(tmp_path, "cooling")
+    jobs = {
+        clock: board(root, clock=clock, tracks=["steps", "seconds"]).jobs()
+        for clock in ("cpu_seconds", "train_seconds")
+    }
+    timed = {clock: ["budget_clock=cpu_seconds" in job for job in own] for clock, own in jobs.items()}
+    assert timed["cpu_seconds"] == [any(text.startswith("budget=") for text in job) for job in jobs["cpu_seconds"]]
+    assert {*timed["cpu_seconds"]} == {False, True} and not any(timed["train_seconds"])
+
+
 def test_a_word_or_number_is_a_list_of_one(tmp_path):
     root = protocol_folder(tmp_path / "root", "cooling", "coarse_camera")
     theirs = str(submission(tmp_path / "theirs", 0.1))

@@ -37,8 +37,9 @@ class BudgetClock(pl.Callback):
     much slower than the calibration would have no time left for it; it then has a third of its steps, beyond the budget, with a
     warning: what it is there for was not trained at all otherwise.
 
-    Seconds are those of ``cost.train_seconds``: evaluation, start-up and the steps of warm-up are outside. What came of the
-    budget is in ``module.results.run["budget"]``, the log and the report. A resumed run keeps its plan and its schedule.
+    Seconds are those of the plan's clock, ``cost.train_seconds`` or ``cost.cpu_seconds``: evaluation, start-up and the steps of
+    warm-up are outside. What came of the budget is in ``module.results.run["budget"]``, the log and the report. A resumed run
+    keeps its plan and its schedule.
 
     Args:
         plan: the plan (``heatsplat.runs.budget.Plan.as_dict``).
@@ -92,7 +93,7 @@ class BudgetClock(pl.Callback):
             self._moved = step if self._moved is None else self._moved
 
     def _spent(self) -> float:
-        return self._meter.train_seconds
+        return getattr(self._meter, self.plan["clock"])
 
     def _dearer(self, progress: float) -> float:
         """How much longer than one of the last steps those that are left will take, for the Gaussians that are still to come.
@@ -122,6 +123,7 @@ class BudgetClock(pl.Callback):
         whole = spent + self.plan["calibration_s"]
         found = {
             "asked_s": self.plan["asked_s"],
+            "clock": self.plan["clock"],
             "calibration_s": self.plan["calibration_s"],
             "train_s": round(spent, 3),
             "off_percent": round(100 * (whole / self.plan["asked_s"] - 1), 2),

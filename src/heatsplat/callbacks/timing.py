@@ -56,7 +56,7 @@ class CostMeter(pl.Callback):
         self.every, self.warmup_steps = every, warmup_steps
         self.fps_views, self.fps_repeats = fps_views, fps_repeats
         self.seconds = {"train": 0.0, "warmup": 0.0, "evaluation": 0.0}
-        self.cpu_seconds = 0.0
+        self._cpu_before = 0.0
         self.steps = 0
         self.peak_mb = 0.0
         self._since: float | None = None
@@ -70,7 +70,7 @@ class CostMeter(pl.Callback):
         """Ends the running phase and starts another; None stops the clock."""
         if module.device.type == "cuda":
             torch.cuda.synchronize(module.device)
-        self.seconds, self.cpu_seconds = self._reading(), self._cpu_reading()
+        self.seconds, self._cpu_before = self._reading(), self.cpu_seconds
         self._since = None if phase is None else time.perf_counter()
         self._cpu_since = time.process_time()
         self._phase = phase or self._phase
@@ -126,10 +126,11 @@ class CostMeter(pl.Callback):
         """Seconds of training up to now."""
         return self._reading()["train"]
 
-    def _cpu_reading(self) -> float:
+    @property
+    def cpu_seconds(self) -> float:
         """Processor seconds of training up to now, likewise."""
         running = self._since is not None and self._phase == "train"
-        return self.cpu_seconds + (time.process_time() - self._cpu_since if running else 0.0)
+        return self._cpu_before + (time.process_time() - self._cpu_since if running else 0.0)
 
     def _publish(self, module: pl.LightningModule) -> None:
         """Puts what is known into the results, on which other callbacks read the training seconds."""
@@ -137,7 +138,7 @@ class CostMeter(pl.Callback):
         seconds = self._reading()
         if self.steps:
             put("cost", "train_seconds", seconds["train"])
-            put("cost", "cpu_seconds", self._cpu_reading())
+            put("cost", "cpu_seconds", self.cpu_seconds)
             put("cost", "steps_per_second", self.steps / seconds["train"])
         else:
             for name in ("train_seconds", "cpu_seconds", "steps_per_second"):
@@ -189,13 +190,13 @@ class CostMeter(pl.Callback):
     def state_dict(self) -> dict[str, Any]:
         return {
             "seconds": self._reading(),
-            "cpu_seconds": self._cpu_reading(),
+            "cpu_seconds": self.cpu_seconds,
             "steps": self.steps,
             "peak_mb": self.peak_mb,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.seconds, self.cpu_seconds = dict(state["seconds"]), state["cpu_seconds"]
+        self.seconds, self._cpu_before = dict(state["seconds"]), state["cpu_seconds"]
         self.steps, self.peak_mb = state["steps"], state["peak_mb"]
 
 

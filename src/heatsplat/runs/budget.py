@@ -11,7 +11,6 @@ import logging
 import math
 import re
 import statistics
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from heatsplat.runs.curves import CURVES_FILE, Choice, Outlook, Point, read_poin
 from heatsplat.runs.device import device_of
 from heatsplat.runs.stepping import Stepper
 from heatsplat.runs.verdicts import with_verdicts
+from heatsplat.training.clocks import read_clock
 from heatsplat.training.rng import generator_for
 
 log = logging.getLogger("heatsplat")
@@ -79,7 +79,14 @@ class Pace:
         return self.base_s + self.per_gaussian_s * gaussians
 
 
-def calibrate(make: Callable[[], Any], scene: SceneData, max_steps: int, budget_s: float, device: str = "cpu") -> Pace:
+def calibrate(
+    make: Callable[[], Any],
+    scene: SceneData,
+    max_steps: int,
+    budget_s: float,
+    device: str = "cpu",
+    clock: str = "train_seconds",
+) -> Pace:
     """What a step costs: whole steps (render, loss, backward, optimiser) with the scene's points, and with four times them.
 
     The two sizes take turns on the same views; the median of each counts, because a run will live with what else the
@@ -92,18 +99,22 @@ def calibrate(make: Callable[[], Any], scene: SceneData, max_steps: int, budget_
         max_steps: length of a run, for schedules.
         budget_s: seconds that the whole run may take.
         device: where it trains.
+        clock: that seconds are of: "train_seconds" | "cpu_seconds".
     """
-    steppers = [Stepper(make(), _denser(scene, factor), step=max_steps // 2, device=device) for factor in (1, DENSER)]
+    steppers = [
+        Stepper(make(), _denser(scene, factor), step=max_steps // 2, device=device, clock=clock)
+        for factor in (1, DENSER)
+    ]
     times: list[list[float]] = [[] for _ in steppers]
     views = [scene.train[i] for i in range(min(len(scene.train), CALIBRATION_VIEWS))]
     for turn in range(WARM_UP):
         for stepper in steppers:
             stepper.step(views[turn % len(views)])
-    limit, start = min(CALIBRATION_SHARE * budget_s, CALIBRATION_SECONDS), time.perf_counter()
+    limit, start = min(CALIBRATION_SHARE * budget_s, CALIBRATION_SECONDS), read_clock(clock)
     for turn in range(CALIBRATION_ROUNDS[1]):
         for stepper, own in zip(steppers, times, strict=True):
             own.append(stepper.step(views[turn % len(views)]))
-        spent = time.perf_counter() - start
+        spent = read_clock(clock) - start
         next_spent = spent * (turn + 2) / (turn + 1)
         if turn + 1 >= CALIBRATION_ROUNDS[0] and next_spent > limit:
             break
@@ -155,6 +166,7 @@ class Plan:
         points: Gaussians of the start.
         gaussian_us: microseconds that one Gaussian more adds to a step, by the calibration.
         gaussians: mean over the run.
+        clock: that all seconds are of, "train_seconds" | "cpu_seconds".
     """
 
     asked_s: float
@@ -174,6 +186,7 @@ class Plan:
     points: int = 0
     gaussian_us: float = 0.0
     gaussians: float = 0.0
+    clock: str = "train_seconds"
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as they travel in a checkpoint."""
@@ -391,9 +404,10 @@ def _measured(config: dict[str, Any], scene: SceneData) -> Plan:
     log.info("measuring what a step costs here")
     module, seconds = with_verdicts(config)["module"], config["budget"]
     device = device_of(config["trainer"]["accelerator"], config["renderer"])
-    pace = calibrate(lambda: build(module), scene, config["max_steps"], seconds, device)
+    pace = calibrate(lambda: build(module), scene, config["max_steps"], seconds, device, config["budget_clock"])
     cap_max = config["density"].get("cap_max")
     made = plan(points, config["name"], pace, seconds, cap_max, "optim.decay" not in keys_of(overrides))
+    made = replace(made, clock=config["budget_clock"])
     for line in made.lines():
         log.info("%s", line)
     return made

@@ -11,13 +11,14 @@ from typing import Any
 import torch
 
 from heatsplat.composition import copied_settings, module_settings, overlap
-from heatsplat.contracts import SceneError, check_count
+from heatsplat.contracts import SceneError, check_count, check_option
 from heatsplat.effects import assembly
 from heatsplat.io.command_lines import keys_of
 from heatsplat.io.settings import at, walk
 from heatsplat.runs.budget import seconds_of
 from heatsplat.runs.declared import check_declared
 from heatsplat.runs.device import device_of
+from heatsplat.training.clocks import CLOCKS
 from heatsplat.training.init import Pretrained, check_start
 
 log = logging.getLogger(__name__)
@@ -57,6 +58,11 @@ def checked(config: dict[str, Any]) -> dict[str, Any]:
         log.warning(
             "callbacks.report=null leaves no metrics.json: tables of runs have no row of this one. callbacks.report.html=false "
             "and callbacks.report.show=false leave out the page and the table on the screen"
+        )
+    check_option("budget_clock", config["budget_clock"], CLOCKS, SceneError)
+    if config["budget"] is None and "budget_clock" in keys_of(config["overrides"]):
+        raise SceneError(
+            "budget_clock says what the seconds of a budget are, and there is none: give budget=, or leave it out"
         )
     if config["budget"] is not None:
         config = config | {"budget": seconds_of(config["budget"])}
@@ -163,6 +169,10 @@ def _weights(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 def _check_machine(config: Mapping[str, Any]) -> None:
     device = device_of(config["trainer"]["accelerator"], config["renderer"])
     devices = _devices(config["trainer"].get("devices", 1), device) * (config["trainer"].get("num_nodes") or 1)
+    if device == "cuda" and config["budget_clock"] == "cpu_seconds":
+        raise SceneError(
+            "budget_clock=cpu_seconds counts processor time, and this run trains on a GPU, whose time is not: leave it out"
+        )
     if devices > 1:
         raise SceneError(
             f"one scene trains on one device, but trainer.devices and trainer.num_nodes ask for {devices}: leave them out. "

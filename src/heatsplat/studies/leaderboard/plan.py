@@ -9,19 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from heatsplat.contracts import SceneError, check_option
-from heatsplat.io.command_lines import setting
+from heatsplat.io.command_lines import keys_of, setting
 from heatsplat.io.results import METRICS_FILE
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.leaderboard.earlier import EarlierPage, read_page
 from heatsplat.studies.options import listed, whole_numbers
 from heatsplat.studies.score import META, SCENES, SceneScore, scenes_in, score_submission, scores_of
+from heatsplat.training.clocks import CLOCKS
 
 DECIDED = {
     "method": "methods",
     "data.scene": "scenes",
     "seed": "seeds",
 }  # key of a run -> what chooses among its values
-CLOCKS = ("train_seconds", "cpu_seconds")
 
 
 @dataclass(frozen=True)
@@ -107,6 +107,12 @@ class Board:
         """Those that make each track."""
         return {track: " ".join(self.protocol["tracks"][track]) for track in self.tracks}
 
+    def _overrides(self, track: str) -> list[str]:
+        """Overrides that make a track: equal seconds are seconds of the board's clock."""
+        told = list(self.protocol["tracks"][track])
+        timed = self.clock != "train_seconds" and "budget" in keys_of(told)
+        return [*told, f"budget_clock={self.clock}"] if timed else told
+
     def left_out(self, method: str, scene: str) -> str | None:
         """Why the protocol does not run a method on a scene; None where it does."""
         only = (self.protocol.get("only") or {}).get(method)
@@ -130,7 +136,7 @@ class Board:
                 setting("data.root", self.root),
                 setting("data.scene", scene),
                 f"seed={seed}",
-                *self.protocol["tracks"][track],
+                *self._overrides(track),
                 *own.get(method, ()),
                 f"callbacks.temperatures.image={self.image(method, scene)}",
                 f"leaderboard.track={track}",

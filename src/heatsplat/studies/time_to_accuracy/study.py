@@ -24,10 +24,10 @@ from heatsplat.studies.frontier.runs import find_runs
 from heatsplat.studies.options import listed, non_empty, of_runs
 from heatsplat.studies.time_to_accuracy.report import markdown, picture, records
 from heatsplat.studies.time_to_accuracy.runs import Panel, panels_of, without_length
+from heatsplat.training.clocks import CLOCKS
 
 log = logging.getLogger("heatsplat")
 
-CLOCKS = ("train_seconds", "cpu_seconds")
 IDENTITY = ("method", "data", "data.scene", "data.scene_seed", "seed")  # with the settings, what tells runs apart
 
 
