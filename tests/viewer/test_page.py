@@ -426,6 +426,39 @@ def test_curves_and_the_picture_can_be_kept(page):
     assert kept[0] == 0 and kept[1] > 20 and kept[2] > 50
 
 
+def test_a_report_is_printed_on_light_paper_with_what_is_measured(page):
+    page.execute_script("""viewer.goTo(0); viewer.theme("dark"); viewer.isotherm.choose("above"); viewer.areas.tool = "box";
+      viewer.areas.addInMiddle(); viewer.areas.tool = "point"; viewer.probes.pin(...viewer.middle());""")
+    wait_until(page, "viewer.settled && $('isothermNote').textContent")
+    page.find_element("id", "remarks").send_keys(
+        "r of a wall\nfrom the door"
+    )  # r fits the colours, where nothing is typed
+    page.execute_script("""window.found = null;
+      const restore = window.onafterprint;
+      window.onafterprint = () => {
+        const drawn = $("sheetPicture").firstChild, shown = $("canvas"), { theme } = document.documentElement.dataset;
+        window.found = { theme, facts: $("sheetFacts").textContent, said: $("sheetRemarks").textContent,
+          more: [drawn.width - shown.width, drawn.height - shown.height] };
+        restore();
+      };""")
+    settings = {"printBackground": False, "paperWidth": 8.27, "paperHeight": 11.69}
+    printed = base64.b64decode(page.execute_cdp_cmd("Page.printToPDF", settings)["data"])
+    found = wait_until(page, "window.found")
+    assert printed.startswith(b"%PDF")
+    assert found["theme"] == "light" and page.execute_script("return document.documentElement.dataset.theme") == "dark"
+    assert found["said"] == "r of a wall\nfrom the door" and found["more"][0] == 0 and found["more"][1] > 20
+    words = page.execute_script("return [viewer.shownName, $('timeText').textContent, viewer.isotherm.words]")
+    assert all(word and word in found["facts"] for word in words)
+    page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    seen = page.execute_script(
+        "return ['sheetPicture', 'probes', 'areas', 'chart', 'stage', 'timeBar', 'cameras', 'print', 'quantity']"
+        ".filter((id) => $(id).checkVisibility())"
+    )
+    page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+    assert seen == ["sheetPicture", "probes", "areas", "chart"]
+    assert not page.execute_script("return $('sheetPicture').checkVisibility()")
+
+
 def test_the_camera_can_be_kept_and_rendered(page, trained, tmp_path):
     """It has the pixels of the canvas."""
     told = page.execute_script("""viewer.goTo(0); viewer.turn(0.3, 0.1); viewer.nearer(1);

@@ -154,12 +154,30 @@ class Controls {
     $("saveCamera").onclick = () => viewer.keep(`${viewer.stem}_camera.json`, new Blob([viewer.cameraFile()], { type: "application/json" }));
     $("curves").onclick = () => viewer.keep(`${viewer.stem}_probes.csv`, new Blob([viewer.probes.table()], { type: "text/csv" }));
     $("areasTable").onclick = () => viewer.keep(`${viewer.stem}_areas.csv`, new Blob([viewer.areas.table()], { type: "text/csv" }));
+    this.listenToPrinter();
     $("run").onchange = () => $("run").files[0] && viewer.openRun($("run").files[0]);
     document.body.ondragover = (event) => event.preventDefault();
     document.body.ondrop = (event) => {
       event.preventDefault();
       if (event.dataTransfer.files[0]) viewer.openRun(event.dataTransfer.files[0]);
     };
+  }
+
+  // On paper everything is light, as long as it prints.
+  listenToPrinter() {
+    const { viewer } = this;
+    let before = null;
+    window.onbeforeprint = () => {
+      before ??= document.documentElement.dataset.theme;
+      viewer.theme("light");
+      viewer.frame(performance.now());
+      viewer.fillSheet();
+    };
+    window.onafterprint = () => {
+      viewer.theme(before);
+      before = null;
+    };
+    $("print").onclick = () => window.print();
   }
 
   // Keys ------------------------------------------------------------------------------------------------------------
@@ -169,7 +187,7 @@ class Controls {
     if (event.ctrlKey || event.metaKey || event.altKey || $("keys").open) return;
     const moves = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End"], presses = ["Enter", " "];
     const own = target.matches("[type=range]") ? moves : target.matches("[name=tool]") ? [...moves, " "] : target.matches("[type=radio]") ? [...moves, ...presses] : target.matches("input, button") ? presses : [];
-    if (target.matches("input[type=number], select") || own.includes(key)) return;
+    if (target.matches("input[type=number], select, textarea") || own.includes(key)) return;
     const far = event.shiftKey ? 4 : 1, turn = 0.06 * far;
     const actions = {
       ArrowLeft: () => viewer.turn(turn, 0), ArrowRight: () => viewer.turn(-turn, 0),

@@ -591,6 +591,16 @@ class Viewer {
     return page;
   }
 
+  // What the printed report has beside probes, boxes and lines: the picture, what it shows and when, remarks.
+  fillSheet() {
+    const { told, isotherm } = this, { how } = isotherm.shown;
+    $("sheetPicture").replaceChildren(this.picturePage());
+    const shown = `${this.shownName}${this.unit ? ` (${this.unit})` : ""}`, lit = how === "none" ? "" : `green: ${isotherm.words}, ${$("isothermNote").textContent}`;
+    const facts = [shown, told.span ? $("timeText").textContent : "", lit.replace(/, $/, ""), $("facts").textContent];
+    $("sheetFacts").textContent = facts.filter(Boolean).join(" · ");
+    $("sheetRemarks").textContent = $("remarks").value.trim();
+  }
+
   // A path of the marks as SVG draws it, enlarged.
   tracePath(context, path, ratio) {
     const told = (key) => path.getAttribute(key), drawn = new Path2D(told("d"));
@@ -769,9 +779,8 @@ class Viewer {
     this.request();
   }
 
-  theme() {
-    const root = document.documentElement;
-    root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
+  theme(name = document.documentElement.dataset.theme === "dark" ? "light" : "dark") {
+    document.documentElement.dataset.theme = name;
     this.request();
   }
 
