@@ -90,6 +90,12 @@ and behind such air. Beside a common course, a flow of heat between neighbours i
 most 1.17 times as fast as the levels that they share, for a flow adds to that rate (0.5 to 1.1 times on 15 recordings with a lamp
 and no flow). If they answer faster, it cannot be told: bodies of two rates do so, too.
 
+**Heat that flows.** Where nothing drives the points, contrasts between neighbours fade as fast as the levels that they share,
+but for a flow. Levels fade to the temperature that the scene gives its surroundings, which may be off: by a tenth of the range, a
+flow seemed certain on nine of 11 random scenes without one, or certainly absent where there was one. What levels differ by from
+one another needs no such temperature, but a flow fades it, too. The verdict is certain only if both agree
+(`effects/physical/conduction.py`); on 36 random scenes and nine recordings of presets they do wherever it was right.
+
 **Heat goes on between images.** A camera may jump from image to image; surfaces go on between them. Heat that would take the
 place of an effect in doubt is absent if one or two courses over time do not foresee images that are left out whole, on the line
 between their neighbours in time (`effects/joint/foreseen.py`), though a decay and a swing as large as the error expected of an

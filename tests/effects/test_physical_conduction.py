@@ -69,14 +69,45 @@ def test_contrasts_that_few_neighbours_show_tell_nothing():
     assert not evidence(seen(values, KNOWN)).told
 
 
+def settling(flow: float) -> torch.Tensor:
+    """Values [P, F] of points that settle at 0.3 from a patch of warmth and spots in it, with a flow between them."""
+    points = drawn(POINTS, 3, seed=4)
+    near = torch.cdist(points, points).topk(NEIGHBOURS + 1, largest=False).indices[:, 1:]
+    excess = 0.3 + 0.15 * points[:, :1] + 0.1 * drawn(POINTS, 1, seed=6)
+    found = [excess]
+    for _ in range(STEPS):
+        excess = excess + (-1.5 * excess + flow * (excess[near].mean(1) - excess)) / STEPS
+        found.append(excess)
+    return 0.3 + torch.cat(found, 1)[:, (PASSED * STEPS).round().long()]
+
+
+def among(values: torch.Tensor, ambient: float | None) -> SimpleNamespace:
+    """What is seen of points that relax, where the surroundings are said to have this image value."""
+    inspected = seen(values, None)
+    fit, _ = inspected.joint
+    inspected.joint = replace(fit, data=replace(fit.data, ambient=ambient)), Model.of(relaxation=1)
+    inspected.obs.ambient, inspected.scene.ambient_c = ambient, 12.0
+    return inspected
+
+
 @pytest.mark.parametrize("ambient, of", [(0.0, r"surroundings by \(12 °C\)"), (None, "nobody knows the surroundings")])
 def test_the_reason_says_of_what_levels_fade(ambient, of):
     """Given a temperature that nothing settles at, levels seem to fade less than contrasts: who reads that can tell."""
-    fading = 0.3 + 0.1 * (2.0 + drawn(POINTS, 1, seed=6)) * torch.exp(-2.0 * PASSED)
-    inspected = seen(fading, None)
-    inspected.joint = (
-        replace(inspected.joint[0], data=replace(inspected.joint[0].data, ambient=ambient)),
-        Model.of(relaxation=1),
-    )
-    inspected.obs.ambient, inspected.scene.ambient_c = ambient, 12.0
-    assert re.search(of, evidence(inspected).reason)
+    assert re.search(of, evidence(among(settling(0.0), ambient)).reason)
+
+
+def test_where_surfaces_settle_at_the_temperature_of_the_surroundings_a_flow_is_told():
+    without, flowing = (evidence(among(settling(flow), 0.3)) for flow in (0.0, 2.0))
+    assert without.told and without.statistic < 0.5
+    assert flowing.told and flowing.statistic > 2.0
+
+
+def test_where_surfaces_settle_elsewhere_no_flow_is_told_that_is_none():
+    found = evidence(among(settling(0.0), 0.1))
+    assert found.statistic > 2.0 and not found.told
+    assert "of what they differ from one another by: cannot be told" in found.reason
+
+
+def test_where_surfaces_settle_elsewhere_a_flow_is_not_ruled_out():
+    found = evidence(among(settling(1.0), 0.38))
+    assert found.statistic < 0.5 and not found.told
