@@ -8,6 +8,8 @@ import pytest
 import torch
 from weathered import HOUR_S, make_weather
 
+from heatsplat.contracts import Weather
+from heatsplat.effects import weather_record
 from heatsplat.effects.joint.held_out import HeldOut
 from heatsplat.effects.weathered import (
     ALBEDO,
@@ -191,3 +193,43 @@ def test_a_certain_gain_that_is_too_small_does_not_ask_for_more_frames():
         evidence = weighed(gain, "found", large)
         assert not evidence.told and "too small" in evidence.reason and "frames" not in evidence.reason
     assert "from 36 frames, about 57 frames would tell" in weighed(HeldOut(2.5, 2.4, 36), "found").reason
+
+
+def day_after_day(days, after=0):
+    """A record of so many days before the first frame, and after the last one, as the weather of one day repeats itself."""
+    times = HOUR_S / 2 * torch.arange(-48 * days, 48 * (after + 1), dtype=torch.float64)
+    phase = 2.0 * torch.pi * times / (24 * HOUR_S)
+    return Weather(
+        times,
+        air_c=15.0 + 5.0 * phase.sin() + torch.sin(phase / 11.0),
+        wind_m_s=1.0 + (phase / 3.0).sin().abs(),
+        humidity_percent=60.0 - 10.0 * phase.sin(),
+        irradiance_w_m2=800.0 * phase.sin().clamp_min(0.0),
+    )
+
+
+def test_of_a_long_record_nothing_is_worked_out_that_bodies_have_forgotten_or_that_no_frame_sees(monkeypatch):
+    """A record of a year took 20 s of the choice of effects; what came of it stays the same."""
+    frames = torch.linspace(0.0, 10 * HOUR_S, 12, dtype=torch.float64)
+    weather, ones = day_after_day(200, after=100), torch.ones(3, 12, dtype=torch.float64)
+    seen = Weathered(weather, frames, 15.0 * ones, ones, ones, None)
+    quick, slow = [1.0 / HOUR_S], [1.0 / (48 * HOUR_S)]
+
+    def answers():
+        found = [torch.cat(seen._answers(seen._drivers[0], seen._exchange(0.5), rates)[:1]) for rates in (quick, slow)]
+        return [*found, weather_record.drivers(weather, frames)]
+
+    few = len(weather.times_s[weather_record.remembered(weather.times_s, torch.tensor(quick), frames)])
+    assert few < 48 * 2
+    short = answers()
+    monkeypatch.setattr(weather_record, "FORGOTTEN", torch.inf)
+    for one, other in zip(short, answers(), strict=True):
+        assert (one - other).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("frames_s", [[0.0, 90.0], [-5.0, 0.0], [200.0, 300.0], [60.0, 60.0]])
+def test_what_bodies_remember_reaches_from_before_the_first_frame_to_after_the_last(frames_s):
+    times = torch.tensor([0.0, 60.0, 120.0, 180.0], dtype=torch.float64)
+    found = times[weather_record.remembered(times, torch.tensor([1.0]), torch.tensor(frames_s, dtype=torch.float64))]
+    assert len(found) >= 2
+    assert found[0] <= max(frames_s[0], 0.0) and found[-1] >= min(frames_s[-1], 180.0)

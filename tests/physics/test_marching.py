@@ -168,3 +168,27 @@ def test_views_in_any_order_see_what_a_march_of_their_own_finds(climate, surface
     for time in (0.0, 5000.0, 5000.0, 40_000.0, 9000.0, 86_400.0):
         alone = stepped_temperature(climate, rows(surface, ids), time)
         torch.testing.assert_close(course.temperature(time, ids), alone, atol=2e-4, rtol=0)
+
+
+def test_what_surfaces_have_forgotten_of_a_long_record_is_not_marched(surface, monkeypatch):
+    """Under a record of a year training took four times as long, and found the same."""
+    climate, marched = Climate(drivers(days=40.0)), []
+    moments = 35 * 86_400.0 + MOMENTS[:4]
+    ids, names = torch.arange(COUNT), parameters(surface)
+    kept, march_now = Kept(climate, moments), marching.march
+
+    def counted(*args, first=0, **more):
+        marched.append((first, len(args[1].log_rate)))
+        return march_now(*args, first=first, **more)
+
+    monkeypatch.setattr(marching, "march", counted)
+    found = torch.stack(
+        [
+            kept.temperature(surface, t, ids, (surface.normals,), torch.zeros(COUNT, len(names)))
+            for t in moments.tolist()
+        ]
+    )
+    whole = march_now(climate, surface, moments)
+    torch.testing.assert_close(found, whole[..., 0], atol=1e-4, rtol=0)
+    late = sum(count for first, count in marched if first > 35 * 144 / 2) / sum(count for _, count in marched)
+    assert late > (0.7 if surface.core is None else 0.1), marched

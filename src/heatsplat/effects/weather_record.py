@@ -12,6 +12,7 @@ from heatsplat.effects.observations import Observations
 INSTEAD = {"harmonic_source": "the recorded weather drives the scene"}
 QUICK_PER_S, SLOW_PER_S = 1 / 1200.0, 1 / 14400.0  # bodies that follow within 20 minutes and within 4 hours
 MEAN_K = 290.0
+FORGOTTEN = 20.0  # time constants after which nothing is left of what a body was: 2e-9
 
 
 def directed(scene: SceneData) -> str | None:
@@ -64,21 +65,39 @@ def _span(values: Tensor) -> float:
 
 def at(weather: Weather, series: Tensor, times_s: Tensor) -> Tensor:
     """A series [T, ...] of the record at times [F] within it, linear between samples; its ends beyond."""
-    above = torch.searchsorted(weather.times_s, times_s).clamp(1, len(weather.times_s) - 1)
-    before, after = weather.times_s[above - 1], weather.times_s[above]
+    return _between(weather.times_s, series, times_s)
+
+
+def _between(samples_s: Tensor, series: Tensor, times_s: Tensor) -> Tensor:
+    above = torch.searchsorted(samples_s, times_s).clamp(1, len(samples_s) - 1)
+    before, after = samples_s[above - 1], samples_s[above]
     share = ((times_s - before) / (after - before)).clamp(0, 1).reshape(-1, *[1] * (series.ndim - 1))
     return series[above - 1] * (1 - share) + series[above] * share
 
 
+def remembered(times_s: Tensor, per_s: Tensor, frames_s: Tensor) -> slice:
+    """Of the samples [T] of a record, those that bodies at the frames' times [F] still know of: all but what came after the last
+    frame, and what they have forgotten by the first. A record of a year else takes a year's time.
+
+    Args:
+        per_s: [T - 1] or a number: the least rate of the bodies from each sample to the next.
+    """
+    last = int(torch.searchsorted(times_s, frames_s.max()).clamp(1, len(times_s) - 1))
+    first = int(torch.searchsorted(times_s, frames_s.min()).clamp(1, len(times_s) - 1))
+    passed = (per_s * times_s.diff())[: first - 1].flip(0).cumsum(0)
+    return slice(first - 1 - int((passed < FORGOTTEN).sum()), last + 1)
+
+
 def _answers(weather: Weather, series: Tensor, rates: tuple[float, ...], times_s: Tensor) -> Tensor:
     """What bodies of these rates make of a series, [F, rates]: centred, of unit size."""
-    series, steps = series - series.mean(), weather.times_s.diff()
+    seen = remembered(weather.times_s, torch.tensor(min(rates)), times_s)
+    series, steps = (series - series.mean())[seen], weather.times_s[seen].diff()
     columns = []
     for rate in rates:
         keep, state = torch.exp(-rate * steps), torch.zeros_like(series)
         for i in range(len(steps)):
             state[i + 1] = keep[i] * state[i] + (1 - keep[i]) * 0.5 * (series[i] + series[i + 1])
-        columns.append(at(weather, state, times_s))
+        columns.append(_between(weather.times_s[seen], state, times_s))
     found = torch.stack(columns, 1)
     found = found - found.mean(0)
     return found / found.norm(dim=0).clamp_min(1e-12)

@@ -510,11 +510,18 @@ class Weathered:
             rates_per_s: R rates at the mean exchange.
         """
         times, rate = self.weather.times_s, torch.tensor(rates_per_s, dtype=torch.float64)[:, None]
+        given = 0.5 * (exchange[1:] + exchange[:-1])
+        seen = weather_record.remembered(times, given * min(rates_per_s), self.times_s)
+        times, drivers, exchange, given = (
+            times[seen],
+            drivers[seen],
+            exchange[seen],
+            rate * given[seen][: len(times[seen]) - 1],
+        )
         # Of long waves and light the body takes what it takes; wind changes how soon it gives that to the air.
         driven = torch.cat([exchange[:, None] * drivers[:, :1], drivers[:, 1:]], 1)
         # Nothing drives the decay.
         driven = torch.cat([0.5 * (driven[1:] + driven[:-1]), torch.zeros_like(driven[1:, :1])], 1)
-        given = rate * 0.5 * (exchange[1:] + exchange[:-1])
         keep = torch.exp(-given * times.diff())
         over = rate * (1.0 - keep) / given
         rest = torch.cat([drivers[0, :1], drivers[0, 1:] / exchange[0], torch.ones(1, dtype=torch.float64)])

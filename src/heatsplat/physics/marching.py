@@ -23,8 +23,9 @@ from torch import Tensor
 
 from heatsplat.kernels import heat_balance as kernels
 from heatsplat.physics.energy_balance import Climate
-from heatsplat.physics.responses import interval_of
+from heatsplat.physics.responses import driver_means, interval_of
 from heatsplat.physics.surfaces import Surface
+from heatsplat.physics.units import DAY_S
 
 CHANGE = 0.05  # of a parameter, in its unit below, at which a surface is marched anew
 UNITS = {
@@ -32,6 +33,8 @@ UNITS = {
     "core_start": 40.0, "core_log_rate": 1.0, "log_coupling": 1.0,  # K, 1, 1
 }  # fmt: skip
 KEPT_BYTES = 4 << 30  # of tables of moments, the latest; earlier ones, which need more, are marched for every view
+FORGOTTEN = 40.0  # time constants after which nothing is left of a start: 4e-18 of it, in twice as long as the mean balance says
+STEEPEST = 0.5  # of radiation's slope at the reference, at 60 K below
 COURSE_BYTES = 256 << 20  # of states at samples; what needs more keeps only some of the samples
 
 
@@ -111,6 +114,35 @@ def march(
     if here is not table:
         table[:, own] = here.to(table.device)
     return table
+
+
+def remembered_from(climate: Climate, surface: Surface, moment_s: Tensor) -> Tensor:
+    """From which sample of the record on surfaces [n] have to be marched for a moment: what came before they have forgotten, and
+    any start will do. One of few samples (1, 2, 4, ... days before), so that many surfaces share one."""
+    times, wind = climate.drivers.times_s, climate.drivers.wind_anomaly
+    rate = surface.log_rate.detach().double().exp()
+    found = torch.zeros(len(rate), dtype=torch.int64, device=rate.device)
+    days = 1.0
+    while (since := float(moment_s) - days * DAY_S) > float(times[0]):
+        sample = int(torch.searchsorted(times, since, right=True)) - 1
+        last = int(torch.searchsorted(times, moment_s, right=True)) - 1
+        if last <= sample:
+            break
+        exchange = torch.ones_like(rate)
+        if surface.wind is not None and wind is not None:
+            mean = float(driver_means(times[sample : last + 1], wind[sample : last + 1]))
+            exchange = exchange + surface.wind.detach().double() * mean
+        if surface.share is not None:
+            share = surface.share.detach().double()
+            exchange = (1.0 - share) * exchange + STEEPEST * share
+        if surface.core is not None:  # the slower of two decays is no slower than this
+            following = (surface.core.log_rate.detach().double().exp() / rate).clamp_min(1e-300)
+            coupling = surface.core.coupling.detach().double()
+            exchange = exchange * following / (exchange + coupling + following)
+        passed = float(times[last] - times[sample])
+        found = torch.where((found == 0) & (rate * exchange * passed > FORGOTTEN), sample, found)
+        days *= 2.0
+    return found
 
 
 def stepped_temperature(climate: Climate, surface: Surface, time_s: float) -> Tensor:
@@ -198,7 +230,10 @@ class Kept:
             rows = ids[stale]
             columns = dict(zip(names, self._marched_at[rows].unbind(1), strict=True))
             there = with_parameters(rows_of(surface, stale), columns)
-            march(self.climate, there, moments_s, into=(self._table, rows))
+            first = remembered_from(self.climate, there, self.moments_s[0])
+            for sample in first.unique().tolist():
+                alike = (first == sample).nonzero()[:, 0]
+                march(self.climate, rows_of(there, alike), moments_s, first=sample, into=(self._table, rows[alike]))
             self._known[rows] = True
 
     def temperature(
