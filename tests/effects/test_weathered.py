@@ -227,6 +227,20 @@ def test_of_a_long_record_nothing_is_worked_out_that_bodies_have_forgotten_or_th
         assert (one - other).abs().max() < 1e-6
 
 
+def test_by_night_no_number_of_a_point_stands_for_sunlight():
+    """The criterion counted three of them for each point, which explain nothing."""
+    weather = day_after_day(3, after=2)
+    by_day, by_night = (torch.linspace(first, first + 4, 12, dtype=torch.float64) * HOUR_S for first in (2.0, 18.0))
+    sun = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64).repeat(len(weather.times_s) // 2, 1)
+    weather = replace(weather, sun=sun, direct_w_m2=weather.irradiance_w_m2)
+    assert weather_record.drivers(weather, by_day).shape == (12, 4)
+    assert weather_record.drivers(weather, by_night).shape[1] == 3  # what bodies of four hours have not forgotten
+    unlit = replace(weather, irradiance_w_m2=0 * weather.air_c, direct_w_m2=0 * weather.air_c)
+    found = weather_record.drivers(unlit, by_night)
+    assert found.shape == (12, 1) and found.norm() == pytest.approx(1.0)
+    assert weather_record.drivers(replace(unlit, air_c=torch.ones_like(weather.air_c)), by_night).shape == (12, 1)
+
+
 @pytest.mark.parametrize("frames_s", [[0.0, 90.0], [-5.0, 0.0], [200.0, 300.0], [60.0, 60.0]])
 def test_what_bodies_remember_reaches_from_before_the_first_frame_to_after_the_last(frames_s):
     times = torch.tensor([0.0, 60.0, 120.0, 180.0], dtype=torch.float64)

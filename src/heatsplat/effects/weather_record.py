@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -12,6 +14,8 @@ from heatsplat.effects.observations import Observations
 INSTEAD = {"harmonic_source": "the recorded weather drives the scene"}
 QUICK_PER_S, SLOW_PER_S = 1 / 1200.0, 1 / 14400.0  # bodies that follow within 20 minutes and within 4 hours
 MEAN_K = 290.0
+# Root mean square over the frames of an answer to air and to light below which it warms nothing that an image shows.
+LEAST_K, LEAST_W_M2 = 1e-3, 0.1
 FORGOTTEN = 20.0  # time constants after which nothing is left of what a body was: 2e-9
 
 
@@ -30,20 +34,25 @@ def drives(weather: Weather | None) -> bool:
 
 def drivers(weather: Weather | None, times_s: Tensor | None, air: tuple[float, ...] = (SLOW_PER_S,)) -> Tensor | None:
     """Answers [F, k] to air (of bodies of these rates) and sun at the frames' times, of unit size; None without a record that
-    ``drives``."""
+    ``drives``. What does not change while images are taken is none, such as sunlight by night: it would give each point numbers
+    that explain nothing."""
     if times_s is None or not drives(weather):
         return None
     found = []
     if weather.air_c is not None:
-        found.append(_answers(weather, weather.air_c, air, times_s))
+        found.append(_answers(weather, weather.air_c, air, times_s) / LEAST_K)
     if weather.irradiance_w_m2 is not None:
-        found.append(_answers(weather, weather.irradiance_w_m2, (QUICK_PER_S, SLOW_PER_S), times_s))
+        found.append(_answers(weather, weather.irradiance_w_m2, (QUICK_PER_S, SLOW_PER_S), times_s) / LEAST_W_M2)
     if weather.direct_w_m2 is not None and weather.sun is not None:
         # Walls that face the morning and walls that face the evening: the sun's way along the ground.
         level = weather.sun - (weather.sun @ weather.up)[:, None] * weather.up
         _, _, axes = torch.linalg.svd(level - level.mean(0), full_matrices=False)
-        found.append(_answers(weather, weather.direct_w_m2 * (level @ axes[0]), (SLOW_PER_S,), times_s))
-    return torch.cat(found, 1)
+        found.append(_answers(weather, weather.direct_w_m2 * (level @ axes[0]), (SLOW_PER_S,), times_s) / LEAST_W_M2)
+    found = torch.cat(found, 1)
+    size = found.norm(dim=0)
+    shows = size > math.sqrt(len(found))
+    shows[size.argmax()] = True  # one at least: a record stands for relaxation
+    return found[:, shows] / size[shows].clamp_min(1e-12)
 
 
 def bent(obs: Observations) -> bool:
@@ -89,7 +98,7 @@ def remembered(times_s: Tensor, per_s: Tensor, frames_s: Tensor) -> slice:
 
 
 def _answers(weather: Weather, series: Tensor, rates: tuple[float, ...], times_s: Tensor) -> Tensor:
-    """What bodies of these rates make of a series, [F, rates]: centred, of unit size."""
+    """What bodies of these rates make of a series, [F, rates], in its unit and centred."""
     seen = remembered(weather.times_s, torch.tensor(min(rates)), times_s)
     series, steps = (series - series.mean())[seen], weather.times_s[seen].diff()
     columns = []
@@ -99,5 +108,4 @@ def _answers(weather: Weather, series: Tensor, rates: tuple[float, ...], times_s
             state[i + 1] = keep[i] * state[i] + (1 - keep[i]) * 0.5 * (series[i] + series[i + 1])
         columns.append(_between(weather.times_s[seen], state, times_s))
     found = torch.stack(columns, 1)
-    found = found - found.mean(0)
-    return found / found.norm(dim=0).clamp_min(1e-12)
+    return found - found.mean(0)
