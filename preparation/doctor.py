@@ -62,7 +62,7 @@ def check(
 
     Args:
         folder: a scene, or a camera's files.
-        target: where doctor.json is written; None: in the working directory.
+        target: where doctor.json is written; None: in the working directory, where that takes files.
         downscale: factor by which images of a scene shrink before they are looked at.
         counts, bounds_c: of ``Meaning``, for a camera's files.
         zone, table, table_columns: of ``Reading``, for a camera's files.
@@ -85,8 +85,14 @@ def check(
     if _more_with_cameras(materials, found):
         log.info("%s", LATER)
     path = (target or Path()) / FINDINGS_FILE
-    write_findings(found, path)
-    log.info("%s", path)
+    try:
+        write_findings(found, path)
+    except OSError as error:
+        if target is not None:
+            raise
+        log.warning("%s is not written, as this folder takes no files (%s): target=FOLDER gives another", path, error)
+    else:
+        log.info("%s", path)
     return found
 
 

@@ -42,6 +42,19 @@ def test_a_clean_scene_has_no_findings_and_the_file_says_so(tmp_path):
     assert json.loads((tmp_path / "doctor.json").read_text()) == []
 
 
+def test_a_working_directory_that_takes_no_files_does_not_fail_what_was_found(tmp_path, caplog, monkeypatch):
+    write_colmap(still(), tmp_path / "scene")
+
+    def refused(found, path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("heatsplat.preparation.doctor.write_findings", refused)
+    assert check(str(tmp_path / "scene")) == []
+    assert "doctor.json is not written" in caplog.text and "target=FOLDER" in caplog.text
+    with pytest.raises(PermissionError):
+        check(str(tmp_path / "scene"), tmp_path)
+
+
 @pytest.mark.parametrize(
     ("layout", "told"),
     [
