@@ -37,15 +37,13 @@ from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene,
 from heatsplat.datamodules.side_files import finite
 from heatsplat.datamodules.splits import ALL, SplitRule
 from heatsplat.datamodules.weather import weather_at_frame
-from heatsplat.datamodules.weather_table import FIRST_EPOCH_S
+from heatsplat.datamodules.weather_table import FIRST_EPOCH_S, LAST_EPOCH_S
 from heatsplat.physics.defects import dead_pixels
 
 log = logging.getLogger(__name__)
 
 MAX_VAL_VIEWS = 8
 FITTED = "scores tell how well they are fitted, not how well other views are foreseen"
-# Seconds: three hundred centuries, more than any clock of a recording counts.
-MAX_TIME_S = 1e12
 # Share of the range of the training images that bounds taken from them leave at both ends, for the noise of held-out ones.
 RANGE_MARGIN = 0.01
 DEAD_PIXEL_FRAMES = 8  # images that dead pixels are told from
@@ -344,9 +342,16 @@ def _in_order(frames: Sequence[RawFrame]) -> tuple[list[RawFrame], list[float] |
     frames = sorted(frames, key=lambda f: (f.time_s, f.name))
     times = [float(f.time_s) for f in frames]
     for frame, time in zip(frames, times, strict=True):
-        if not abs(time) < MAX_TIME_S:
+        if not abs(time) <= LAST_EPOCH_S:
+            units = {
+                "nanoseconds": 1e9,
+                "microseconds": 1e6,
+                "milliseconds": 1e3,
+            }  # since 1970, as cameras' programs count
+            fits = next((unit for unit, count in units.items() if FIRST_EPOCH_S < time / count < LAST_EPOCH_S), None)
+            told = f"; divide {fits} since 1970 by {units[fits]:,.0f}" if fits else ""
             raise SceneError(
-                f"frame {frame.name} has a time that is no finite number of seconds, or absurdly large: {time}"
+                f"frame {frame.name} has a time that is no finite number of seconds, or absurdly large: {time:.15g}{told}"
             )
     notes = {"duration_s": times[-1] - times[0]}
     if repeated := len(times) - len(set(times)):

@@ -84,12 +84,19 @@ def mapping(values: Any, where: str) -> dict[str, Any]:
     return values or {}
 
 
+def number_in(text: str) -> float:
+    """The number that a text is. Raises ValueError for anything else, as for 1_5, which Python takes for 15."""
+    if "_" in text:
+        raise ValueError(f"could not convert string to float: {text!r}")
+    return float(text)
+
+
 def finite(value: Any, where: str, what: str = "a number") -> float:
     """A number, which may stand in quotes, with a point or a comma. Raises SceneError, naming ``where``, for all else."""
     try:
         if isinstance(value, bool):
             raise TypeError
-        number = float(value.replace(",", ".") if isinstance(value, str) else value)
+        number = number_in(value.replace(",", ".")) if isinstance(value, str) else float(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise SceneError(f"{where} is {shortened(value)}, {what} is needed") from error
     if not math.isfinite(number):
@@ -124,7 +131,7 @@ class Table:
 
     def number(self, cell: str) -> float:
         """The number in a cell. Raises ValueError when it is none."""
-        return float(self.pointed(cell))
+        return number_in(self.pointed(cell))
 
     def pointed(self, cell: str) -> str:
         """The cell with a decimal point."""

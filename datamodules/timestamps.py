@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from zoneinfo import ZoneInfo
 
 from heatsplat.contracts import SceneError
-from heatsplat.datamodules.side_files import read_table
+from heatsplat.datamodules.side_files import number_in, read_table
 from heatsplat.physics.units import DAY_S
 
 DJI_NAME = re.compile(r"DJI_(\d{14})_\d+_[A-Z]")
@@ -90,7 +90,7 @@ def time_by_pattern(name: str, regex: str, form: str | None) -> float:
         raise SceneError(f"data.time_regex {regex!r} does not match the image name {name}")
     part = match[1] if match.re.groups else match[0]
     try:
-        return float(part) if form is None else _of_form(part, form)
+        return number_in(part) if form is None else _of_form(part, form)
     except ValueError as error:
         raise SceneError(f"image name {name}: {part!r} is no time of the form {form or 'seconds'} ({error})") from error
 
@@ -149,7 +149,7 @@ def times_from_csv(path: Path, name_column: str, time_column: str, form: str | N
 def _clock(text: str) -> str:
     """What a time of ``seconds_of`` counts on, in words."""
     try:
-        float(text)
+        number_in(text)
     except ValueError:
         return f"a date-time {'with' if datetime.fromisoformat(text).tzinfo else 'without'} a time zone"
     return "a number of seconds"
@@ -158,6 +158,6 @@ def _clock(text: str) -> str:
 def seconds_of(text: str) -> float:
     """Seconds, or those of an ISO date-time since 1970. Raises ValueError for anything else."""
     try:
-        return float(text)
+        return number_in(text)
     except ValueError:
         return instant(datetime.fromisoformat(text))

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from heatsplat.contracts import RAIN, WEATHER_COLUMNS, SceneError, Weather
-from heatsplat.datamodules.side_files import read_table
+from heatsplat.datamodules.side_files import number_in, read_table
 from heatsplat.datamodules.sun import cover_of
 from heatsplat.datamodules.timestamps import zone_of
 
@@ -238,7 +238,7 @@ def utc_seconds(text: str | float, zone: str | None, where: str, after: float | 
         SceneError: it is neither, or beyond the year 2255, or it has no offset and ``zone`` is None; ``where`` is named.
     """
     try:
-        number = float(text)
+        number = number_in(text) if isinstance(text, str) else float(text)
     except (ValueError, TypeError, OverflowError):
         pass
     else:

@@ -13,6 +13,7 @@ from struct import Struct, error
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.colmap_library import pycolmap
+from heatsplat.datamodules.side_files import number_in
 
 REMEDY = "copy the model or export it from COLMAP again"
 _NUMBER, _COUNT, _POSE = Struct("<I"), Struct("<Q"), 7 * 8  # a pose is a quaternion and a translation
@@ -208,7 +209,7 @@ def _check_text(
 
 def _numbers(words: list[str]) -> bool:
     try:
-        return all(abs(float(word)) < float("inf") for word in words)
+        return all(abs(number_in(word)) < float("inf") for word in words)
     except ValueError:
         return False
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from heatsplat.contracts import SceneError
-from heatsplat.datamodules.side_files import says_fahrenheit
+from heatsplat.datamodules.side_files import number_in, says_fahrenheit
 
 SUFFIX = ".csv"
 MIN_SIDE = 16  # pixels: smaller tables are no images
@@ -109,7 +109,7 @@ def _numbers(line: str, separator: str) -> list[float | None]:
 def _number(cell: str) -> float | None:
     """The number in a cell; None where it is none, as of a pixel that is too hot (">150")."""
     try:
-        return float(cell)
+        return number_in(cell)
     except ValueError:
         return None
 

@@ -83,6 +83,21 @@ def test_a_time_that_is_not_finite_names_its_frame():
         scene_of([grey(i) for i in range(9)], times=[0, 1, 2, float("inf"), 4, 5, 6, 7, 8])
 
 
+@pytest.mark.parametrize(
+    ("count", "told"),
+    [
+        (1e3, "; divide milliseconds since 1970 by 1,000$"),
+        (1e6, "; divide microseconds since 1970 by 1,000,000$"),
+        (1e9, "; divide nanoseconds since 1970 by 1,000,000,000$"),
+        (1e12, r"\d$"),
+    ],
+)
+def test_times_that_count_less_than_seconds_are_refused(count, told):
+    """A flight of ten minutes would take a week, and surfaces would relax as slowly."""
+    with pytest.raises(SceneError, match=rf"000.png has a time that .* absurdly large: .*{told}"):
+        scene_of([grey(i) for i in range(9)], times=[count * (1.72e9 + i) for i in range(9)])
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_integers_span_their_type(dtype):
     images = [grey(i, dtype) for i in range(9)]

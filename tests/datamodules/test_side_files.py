@@ -2,7 +2,8 @@
 
 import pytest
 
-from heatsplat.datamodules.side_files import says_fahrenheit, says_kelvin
+from heatsplat.contracts import SceneError
+from heatsplat.datamodules.side_files import finite, number_in, read_table, says_fahrenheit, says_kelvin
 
 
 @pytest.mark.parametrize(
@@ -34,3 +35,14 @@ def test_text_that_says_kelvin(text):
 )
 def test_text_that_says_no_kelvin(text):
     assert not says_kelvin(text)
+
+
+def test_underscores_within_digits_make_no_number(tmp_path):
+    (tmp_path / "t.csv").write_text("a;b\n1_5;2,5\n")
+    table = read_table(tmp_path / "t.csv")
+    ((_, (one, other)),) = table.rows
+    assert table.number(other) == 2.5 and number_in(" 1e1 ") == 10.0
+    with pytest.raises(ValueError, match="'1_5'"):
+        table.number(one)
+    with pytest.raises(SceneError, match="fl_x is '1_500', a number is needed"):
+        finite("1_500", "fl_x")

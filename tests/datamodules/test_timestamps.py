@@ -106,3 +106,13 @@ def test_a_table_names_missing_columns_and_bad_cells(tmp_path):
         times_from_csv(table, "file", "when")
     with pytest.raises(SceneError, match="line 2: 'soon' in column s is neither seconds nor a date-time"):
         times_from_csv(table, "file", "s")
+
+
+def test_a_name_or_a_cell_with_an_underscore_is_no_number(tmp_path):
+    """Python takes 1_5 for 15."""
+    table = tmp_path / "t.csv"
+    table.write_text("file,s\na,1_5\n")
+    with pytest.raises(SceneError, match="line 2: '1_5' in column s is neither seconds nor a date-time"):
+        times_from_csv(table, "file", "s")
+    with pytest.raises(SceneError, match="'1_5' is no time of the form seconds"):
+        time_by_pattern("frame_1_5.png", r"frame_(.+)\.png", None)
