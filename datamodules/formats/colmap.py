@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from heatsplat.contracts import Camera, SceneError
 from heatsplat.datamodules.formats.colmap_library import pycolmap
-from heatsplat.datamodules.formats.colmap_records import check_records, names_in_text, point_ids_in
+from heatsplat.datamodules.formats.colmap_records import check_records, names_in_text, plain_text, point_ids_in
 from heatsplat.datamodules.formats.lens import MODELS, Lens, lens_of
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
@@ -83,7 +84,8 @@ def read_model_of(folder: Path) -> SparseModel:
     suffix = "bin" if (folder / "cameras.bin").is_file() else "txt"
     check_records(folder, suffix)
     try:
-        model = pycolmap.Reconstruction(str(folder))
+        with TemporaryDirectory() as plain:
+            model = pycolmap.Reconstruction(str(plain_text(folder, Path(plain)) if suffix == "txt" else folder))
     except Exception as error:
         if "amera model" in str(error):
             raise SceneError(

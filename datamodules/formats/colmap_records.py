@@ -15,7 +15,9 @@ from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.colmap_library import pycolmap
 from heatsplat.datamodules.side_files import number_in
 
+PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 REMEDY = "copy the model or export it from COLMAP again"
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _NUMBER, _COUNT, _POSE = Struct("<I"), Struct("<Q"), 7 * 8  # a pose is a quaternion and a translation
 _PARAMS: dict[int, int] = {
     kind.value: len(pycolmap.Camera.create_from_model_id(1, kind, 1.0, 2, 2).params)
@@ -33,7 +35,7 @@ def check_records(folder: Path, suffix: str) -> None:
         SceneError: one does not, or a needed file is missing; the message names the file and the record or line.
     """
     points_told = False
-    for part in ("cameras", "images", "points3D", "rigs", "frames"):
+    for part in PARTS:
         file = folder / f"{part}.{suffix}"
         if not file.is_file():
             if part in ("rigs", "frames"):  # older models have none
@@ -54,16 +56,45 @@ def announced_images(folder: Path) -> int:
         if binary.is_file():
             with binary.open("rb") as file:
                 return _COUNT.unpack(file.read(_COUNT.size))[0]
-        with text.open(encoding="utf-8", errors="replace") as file:
-            counts = (_announced(line) for line in takewhile(lambda line: line.startswith("#"), file))
-            return next((count for count in counts if count is not None), 0)
+        counts = (_announced(line) for line in takewhile(lambda line: line.startswith("#"), text_of(text).splitlines()))
+        return next((count for count in counts if count is not None), 0)
     except (OSError, error):
         return 0
 
 
+def text_of(file: Path) -> str:
+    """Content of a text file, which is UTF-8, or what its byte order mark says; what is none becomes U+FFFD."""
+    data = file.read_bytes()
+    return data.decode("utf-16" if data[:2] in _UTF_16 else "utf-8-sig", errors="replace")
+
+
+def plain_text(folder: Path, into: Path) -> Path:
+    """The folder of a text model that COLMAP's reader understands: the same, or ``into`` with the files of this one without what
+    editors leave in them or take away. That reader takes a byte order mark for a number, knows no line ends of a bare carriage
+    return, and leaves out the last image where its line of points, which may be empty, does not end."""
+    files = {part: folder / f"{part}.txt" for part in PARTS}
+    found = {part: (file.read_bytes(), text_of(file)) for part, file in files.items() if file.is_file()}
+    as_written = all(data == text.encode() and "\r" not in text.replace("\r\n", "") for data, text in found.values())
+    if as_written and not _ends_with_image(found["images"][1]):
+        return folder
+    for part, (_, text) in found.items():
+        lines = text.splitlines()
+        (into / f"{part}.txt").write_bytes("\n".join([*lines, "", ""]).encode())
+    return into
+
+
+def _ends_with_image(text: str) -> bool:
+    """Whether the last line is that of an image, and no line of its points comes after it."""
+    lines, number = text.splitlines(), 0
+    while number < len(lines):
+        record = lines[number].strip()
+        number += 2 if record and not record.startswith("#") else 1
+    return number > len(lines)
+
+
 def names_in_text(file: Path) -> dict[int, str]:
     """Name of every image in an images.txt that is whole, by its number: COLMAP's own reader ends one at its first space."""
-    lines = iter(file.read_text(encoding="utf-8", errors="replace").splitlines())
+    lines = iter(text_of(file).splitlines())
     names = {}
     for line in map(str.strip, lines):
         if line and not line.startswith("#"):
@@ -77,7 +108,7 @@ def point_ids_in(folder: Path) -> list[int]:
     """Numbers of the points of a whole model, in the order of its file."""
     binary = folder / "points3D.bin"
     if not binary.is_file():
-        lines = map(str.strip, (folder / "points3D.txt").read_text(encoding="utf-8", errors="replace").splitlines())
+        lines = map(str.strip, text_of(folder / "points3D.txt").splitlines())
         return [int(line.split(maxsplit=1)[0]) for line in lines if line and not line.startswith("#")]
     data = binary.read_bytes()
     at, ids = _COUNT.size, []
@@ -174,7 +205,7 @@ def _check_text(
     Raises:
         SceneError: a record or line is not whole, or there are not as many as the file says.
     """
-    text = file.read_text(encoding="utf-8", errors="replace")
+    text = text_of(file)
     if not text.strip():
         if may_be_empty:
             return False

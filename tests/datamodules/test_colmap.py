@@ -349,6 +349,34 @@ def test_a_text_model_of_known_cameras_may_have_an_empty_file_of_points(tmp_path
         read_model(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "saved",
+    [
+        lambda text: text.rstrip("\n").encode(),  # editors take away empty lines at the end
+        lambda text: (text.rstrip("\n") + "\n").encode(),
+        lambda text: text.encode("utf-8-sig"),
+        lambda text: text.encode("utf-16"),
+        lambda text: text.replace("\n", "\r\n").encode(),
+        lambda text: text.replace("\n", "\r").encode(),
+    ],
+    ids=["no end", "no last line of points", "mark", "utf-16", "windows", "carriage returns"],
+)
+def test_a_text_model_is_read_as_editors_save_it(tmp_path, saved):
+    """COLMAP's own reader leaves the last image out where its line of points does not end."""
+    folder = find_model(write_colmap(tmp_path, names(9), text=True))
+    expected = read_model(tmp_path)
+    for part in ("cameras", "images", "points3D"):
+        file = folder / f"{part}.txt"
+        lines = [line for line in file.read_text().splitlines() if not line.startswith("#")]
+        if part == "images":
+            lines = [line for one in lines[::2] for line in (one, "")]
+        file.write_bytes(saved("\n".join([*lines, ""])))
+    found = read_model(tmp_path)
+    assert found.names == expected.names and found.folder == folder
+    assert np.array_equal(found.viewmats, expected.viewmats) and np.array_equal(found.points, expected.points)
+    assert found.point_ids == expected.point_ids
+
+
 def test_a_damaged_model_is_named(tmp_path):
     folder = find_model(write_colmap(tmp_path, names(9)))
     (folder / "images.bin").write_bytes((folder / "images.bin").read_bytes()[:60])
