@@ -19,6 +19,9 @@ from heatsplat.geometry.transforms import OPENGL_AXES
 
 # nerfstudio has one OPENCV model for all polynomial lenses; FULL_OPENCV reads whatever of its coefficients are there.
 _COLMAP_NAME = {"OPENCV": "FULL_OPENCV", "PERSPECTIVE": "PINHOLE"}
+# Models of one focal length, and what they are with two: files give fl_y beside them, and nerfstudio itself takes it.
+_OF_TWO = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV",
+           "SIMPLE_RADIAL_FISHEYE": "OPENCV_FISHEYE", "RADIAL_FISHEYE": "OPENCV_FISHEYE"}  # fmt: skip
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _OTHER_POLYNOMIAL = ("k4", "k5", "k6")  # nerfstudio's k4 is that of r^8, which OpenCV does not have; OpenCV's divides
 # Keys of a frame's images, in order of preference: the first of each is the data sets' own.
@@ -178,6 +181,8 @@ def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tu
     if fx is None:
         raise SceneError(f"{source}: no focal length; fl_x or camera_angle_x is needed")
     fy = _focal(values, "y", height, source)
+    if fy is not None and fy != fx:
+        model = _OF_TWO.get(model, model)
     known = {
         "f": fx,
         "fx": fx,

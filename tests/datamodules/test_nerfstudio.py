@@ -271,6 +271,28 @@ def test_distortion_that_the_camera_model_does_not_have_is_refused(tmp_path, val
     assert named.distortion == (0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0)
 
 
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [
+        ("SIMPLE_PINHOLE", {}),
+        ("SIMPLE_RADIAL", {"k1": -0.1}),
+        ("RADIAL", {"k1": -0.1, "k2": 0.02}),
+        ("SIMPLE_RADIAL_FISHEYE", {"k1": 0.01}),
+        ("RADIAL_FISHEYE", {"k1": 0.01, "k2": 0.002}),
+    ],
+)
+def test_two_focal_lengths_count_whatever_the_camera_model_is_called(tmp_path, model, distortion):
+    """The second was left out without a word, which nerfstudio takes."""
+    values = {"fl_x": 50.0, "w": WIDTH, "h": HEIGHT, "camera_model": model} | distortion
+    one, same, two = (
+        lens_in(Transforms(tmp_path, values | more, []), {"file_path": "0.png"}, None)
+        for more in ({}, {"fl_y": 50.0}, {"fl_y": 60.0})
+    )
+    assert one == same and (one.fx, one.fy, one.model) == (50.0, 50.0, model)
+    assert (two.fx, two.fy) == (50.0, 60.0)
+    assert two.fisheye == one.fisheye and [k for k in two.distortion if k] == list(distortion.values())
+
+
 def test_a_folder_thermal_with_cameras_of_its_own(tmp_path):
     for i, name in enumerate(names(9)):
         write_image(tmp_path / "thermal" / "images" / name, grey(i))
