@@ -46,3 +46,8 @@ def test_a_study_that_is_named_has_its_settings_explained():
     )
     assert "\n    - callbacks.probes=null\n" in told and "_target_" not in told
     assert "study=NAME --help explains" in text and "# with study=" not in usage("study", DOC)
+
+
+def test_what_holds_nothing_that_is_told_is_not_told_either():
+    text = usage("render", DOC)
+    assert "listed:" not in text and "camera_file: null" in text and "  downscale: null" in text

@@ -175,6 +175,7 @@ def _job(
                 if check is not None:
                     check(config, output_dir)
                 (output_dir / FAILED).unlink(missing_ok=True)
+                _warn_of_folders(hydra_config)
                 if not (output_dir / METRICS_FILE).exists():
                     _write_down(config, hydra_config, output_dir / ".hydra")
                 return work(plain(config, hydra_config.overrides.task), output_dir)
@@ -191,6 +192,16 @@ def _job(
             sys.exit(1)
 
     return job
+
+
+def _warn_of_folders(hydra_config: DictConfig) -> None:
+    """Warns of a folder that was given and is not used: that of a sweep for a single run, or the other way round."""
+    given = {text.lstrip("+").partition("=")[0] for text in hydra_config.overrides.hydra}
+    sweep = hydra_config.mode == RunMode.MULTIRUN
+    idle, used = ("hydra.run.dir", "hydra.sweep.dir") if sweep else ("hydra.sweep.dir", "hydra.run.dir")
+    if idle in given and used not in given:
+        what = "the jobs of a sweep write" if sweep else "a single run (without -m) writes"
+        log.warning("%s is not used: %s to %s=", idle, what, used)
 
 
 def _remove_unused(folder: Path, log_file: str) -> None:

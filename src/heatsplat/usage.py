@@ -70,8 +70,18 @@ def _options(places: Sequence[Path], group: str, pattern: str = "*") -> dict[str
 def _explained(text: str) -> list[str]:
     """The lines of a file of configuration that say something to a user: choices of groups stand as they are set."""
     internal = ("defaults:", "_target_", "by:", "- _self_", "- override", "- optional", "- /", "# @package")
-    lines = (line for line in text.strip().splitlines() if not line.strip().startswith(internal))
-    return [re.sub(r"^  - (?=\w+: )", "", line) for line in lines if ": ${" not in line or "#" in line]
+    every = text.strip().splitlines()
+    told = [not line.strip().startswith(internal) and (": ${" not in line or "#" in line) for line in every]
+    for i, line in enumerate(every):  # what holds internal lines alone is internal, too
+        inner = list(itertools.takewhile(lambda j: _depth(every[j]) > _depth(line), range(i + 1, len(every))))
+        if inner and re.match(r"\s*\w+:\s*(#.*)?$", line) and not any(told[j] for j in inner):
+            told[i] = False
+    return [re.sub(r"^  - (?=\w+: )", "", line) for line in itertools.compress(every, told)]
+
+
+def _depth(line: str) -> int:
+    """How far a line is indented."""
+    return len(line) - len(line.lstrip())
 
 
 def _sentence(file: Path) -> str:

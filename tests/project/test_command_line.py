@@ -254,6 +254,16 @@ def test_a_sweep_runs_every_job_and_a_failing_one_takes_no_other_down(tmp_path, 
     assert all((path / "checkpoints" / "last.ckpt").exists() for path in jobs if path not in failed)
 
 
+def test_a_folder_that_is_not_used_is_told(tmp_path, told):
+    nowhere = ("method=etgs", "data=rhd", "data.root=/nowhere/at/all")
+    single = told("train", *nowhere, f"hydra.sweep.dir={tmp_path}/sweep", cwd=tmp_path, code=1)
+    assert "hydra.sweep.dir is not used: a single run (without -m) writes to hydra.run.dir=" in single
+    swept = told("train", "-m", *nowhere, "seed=0", f"hydra.run.dir={tmp_path}/run", cwd=tmp_path, code=1)
+    assert "hydra.run.dir is not used: the jobs of a sweep write to hydra.sweep.dir=" in swept
+    both = (f"hydra.run.dir={tmp_path}/run", f"hydra.sweep.dir={tmp_path}/sweep")
+    assert "is not used" not in told("train", *nowhere, *both, cwd=tmp_path, code=1)
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
