@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 # Share by which the sides of an image may differ in their scale from its camera's: those that COLMAP's undistorter trims
 # do by about a hundredth, 4:3 and 5:4 by 7 of them.
 MOST_SQUEEZED = 0.03
+SMALL_PX = 11  # along the shorter side, below which images that were downscaled are warned of: the window of SSIM
 MOST_MASKED = 0.9  # share of all pixels that masks leave out, from which they are rather the wrong way round
 
 
@@ -236,6 +237,12 @@ def image_notes(prepared: Mapping[int, PreparedImage], downscale: float) -> dict
         "downscale": downscale,
         "grid": ", ".join(grids),
     }
+    least = min((p.lens for p in prepared.values()), key=lambda lens: min(lens.width, lens.height))
+    if downscale > 1 and min(least.width, least.height) < SMALL_PX:
+        log.warning(
+            "data.downscale=%g leaves images of %dx%d pixels, of which nothing is seen and SSIM needs %d along each side",
+            downscale, least.width, least.height, SMALL_PX,
+        )  # fmt: skip
     if rescaled := Counter((f["size"], f["camera"]) for f in found if f["size"] != f["camera"]):
         pairs = ", ".join(
             f"{counted(n, 'image')} of {size} with a camera of {of}" for (size, of), n in rescaled.most_common(3)

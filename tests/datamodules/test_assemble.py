@@ -237,6 +237,13 @@ def test_intrinsics_follow_the_pixels_that_are_there(downscale):
     assert scene.notes["grid"] == f"{width}x{height}"
 
 
+def test_images_of_which_next_to_nothing_is_left_are_warned_of(caplog):
+    scene_of([grey(i) for i in range(9)], downscale=2)
+    assert not caplog.text
+    scene_of([grey(i) for i in range(9)], downscale=100)
+    assert "data.downscale=100 leaves images of 1x1 pixels" in caplog.text
+
+
 def test_enlarging_is_refused():
     with pytest.raises(SceneError, match="data.downscale must be 1 or larger, got 0.5"):
         scene_of([grey(i) for i in range(9)], downscale=0.5)
