@@ -73,8 +73,8 @@ def _explained(text: str) -> list[str]:
     every = text.strip().splitlines()
     told = [not line.strip().startswith(internal) and (": ${" not in line or "#" in line) for line in every]
     for i, line in enumerate(every):  # what holds internal lines alone is internal, too
-        inner = list(itertools.takewhile(lambda j: _depth(every[j]) > _depth(line), range(i + 1, len(every))))
-        if inner and re.match(r"\s*\w+:\s*(#.*)?$", line) and not any(told[j] for j in inner):
+        end = next((j for j in range(i + 1, len(every)) if _depth(every[j]) <= _depth(line)), len(every))
+        if end > i + 1 and re.match(r"\s*\w+:\s*(#.*)?$", line) and not any(told[i + 1 : end]):
             told[i] = False
     return [re.sub(r"^  - (?=\w+: )", "", line) for line in itertools.compress(every, told)]
 

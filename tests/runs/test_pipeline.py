@@ -138,6 +138,20 @@ def test_results_whose_checkpoints_were_removed_are_those_of_what_the_command_li
         results_in(tmp_path, heatsplat.compose([*QUICK, "method=etgs", "max_steps=20", "threads=1"]))
 
 
+def test_results_of_a_run_that_lightning_ended_are_those_of_that_length(trained, tmp_path):
+    """Such a run was taken for one of whatever length was asked for."""
+    folder, config, results = trained
+    further = heatsplat.compose([*config["overrides"], "trainer.max_steps=6"])
+    with pytest.raises(OccupiedError, match=r"results of a run with other settings \(trainer.max_steps\)"):
+        results_in(folder, further)
+    (tmp_path / ".hydra").mkdir()
+    shutil.copy(folder / METRICS_FILE, tmp_path)
+    (tmp_path / OVERRIDES).write_text("\n".join(f"- {text}" for text in config["overrides"]))
+    assert results_in(tmp_path, config).test == results.test
+    with pytest.raises(OccupiedError, match=r"other settings \(trainer.max_steps\)"):
+        results_in(tmp_path, further)
+
+
 def test_a_run_goes_on_from_its_latest_step_whenever_its_files_were_copied(trained, tmp_path):
     folder, config, _ = trained
     (tmp_path / "checkpoints").mkdir()

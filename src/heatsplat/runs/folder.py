@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from heatsplat.runs.resume import (
     stored_config,
 )
 
+ENDS = ("max_steps", "max_epochs", "max_time")  # of Lightning's trainer
+
 
 def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
     """The results that a run with this configuration left in a folder; None where there are none.
@@ -35,7 +38,7 @@ def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
     _, newest = next(checkpoints_in(folder), (None, {}))
     stored = stored_config(newest)
     changed = (
-        given_first(differences(checked(config), stored), config, stored)
+        given_first([*differences(checked(config), stored), *_ended_otherwise(config, stored)], config, stored)
         if stored
         else _given_otherwise(folder, config)
     )
@@ -52,6 +55,13 @@ def results_in(folder: Path, config: dict[str, Any]) -> RunResults | None:
     return RunResults.read(folder / METRICS_FILE)
 
 
+def _ended_otherwise(config: dict[str, Any], stored: Mapping[str, Any]) -> list[str]:
+    """Settings by which Lightning ends one run at another step than the other. A run that was stopped so goes on with others;
+    its results stay those of the steps that it took."""
+    here, there = (one.get("trainer") or {} for one in (config, stored))
+    return [f"trainer.{name}" for name in ENDS if here.get(name) != there.get(name)]
+
+
 def _given_otherwise(folder: Path, config: dict[str, Any]) -> list[str]:
     """Settings that a command line gave otherwise to the run in a folder, which has no checkpoint to compare with."""
     if not (folder / OVERRIDES).exists():
@@ -60,4 +70,7 @@ def _given_otherwise(folder: Path, config: dict[str, Any]) -> list[str]:
             "hydra.run.dir (of a sweep: hydra.sweep.dir), or delete that one"
         )
     before, now = learned_by(overrides_of(folder)), learned_by(as_dict(config["overrides"]))
+    ends = {f"trainer.{name}" for name in ENDS}
+    for known, given in ((before, overrides_of(folder)), (now, as_dict(config["overrides"]))):
+        known.update((key, value) for key, value in given.items() if key.lstrip("+~") in ends)
     return sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
