@@ -323,6 +323,14 @@ def test_what_a_pass_of_the_views_hardly_shows_leaves_after_it():
     assert cloud.splats.means[:, 0].tolist() == [0, 3, 15] and not cloud.state["shown"].any()
 
 
+def test_no_pass_comes_before_a_step_that_is_after_the_last(caplog):
+    """A pass came at steps 160 to 179, 30 before that which was asked for."""
+    policy = budget(start=0, stop=0, every=10, remove_at=(210,), remove_by=180)
+    policy.prepare(noisy_scene(0.01, 20), "thermal")
+    assert not any(policy.maps_at(step) for step in range(300))
+    assert "remove_at=[210] begins after density.remove_by=180" in caplog.text
+
+
 def test_of_many_views_the_last_pass_that_ends_in_time_judges_and_what_was_split_in_it_stays():
     def policy_of(views: int) -> Budget:
         policy = budget(start=0, stop=0, every=10, remove_at=(96,), remove_by=180)

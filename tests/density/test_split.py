@@ -108,3 +108,22 @@ def test_the_shortest_axis_stays_the_shortest_since_models_take_it_for_the_norma
     Cloud(splats).split(torch.tensor([0]), LongAxisSplit())
     assert splats.scales.argmin(1).tolist() == before.tolist() * 2
     assert (splats.scales <= torch.tensor(scales) + 1e-6).all()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"offset": -0.1}, {"along": 0.0}, {"across": float("inf")}, {"fade": 0.0}, {"fade": 1.1}, {"fade": float("nan")}],
+)
+def test_a_split_that_is_none_is_refused(wrong):
+    with pytest.raises(ValueError, match=r"density.split: offset must not be negative, .* fade must lie in"):
+        LongAxisSplit(**wrong)
+
+
+@pytest.mark.parametrize(("logit", "fade"), [(40.0, 1.0), (-90.0, 0.5), (0.3, 1.0)])
+def test_opacities_at_their_limits_have_logits(logit, fade):
+    splats = lone()
+    splats["opacity_logits"].data.fill_(logit)
+    Cloud(splats).split(torch.tensor([0]), LongAxisSplit(fade=fade))
+    assert splats["opacity_logits"].isfinite().all()
+    expected = fade * torch.tensor(logit).sigmoid()
+    torch.testing.assert_close(splats.opacities[0, 0], expected, atol=1e-6, rtol=0)

@@ -48,7 +48,8 @@ class Budget(DensityControl):
     Once they have come, Gaussians leave that the training views hardly show: after the first whole pass of the views that
     begins at a step of ``remove_at`` or later, those outside the share ``keep`` of all blending weights, and those seen in
     fewer than two of several views. Where there are so many views that this pass would end after ``remove_by``, it is the last
-    pass that ends by then, and what was split in it stays. Nothing is added after ``stop``, and opacities are never reset.
+    pass that ends by then, and what was split in it stays; a step of ``remove_at`` after ``remove_by`` removes none. Nothing is
+    added after ``stop``, and opacities are never reset.
 
     Blending weights are those on pixels that count: what only masked pixels show is shown by no view. With several modalities,
     errors are those of all images and blending weights those of the first; what another modality shows is never removed.
@@ -142,6 +143,11 @@ class Budget(DensityControl):
     def prepare(self, scene: SceneData, modality: str) -> None:
         """Takes the number of training views, their pixels and, unless given, their noise (that of the first modality)."""
         self.steps_of_pass = len(scene.train)
+        if late := [begin for begin in self.remove_at if begin > self.remove_by]:
+            log.warning(
+                "density.remove_at=%s begins after density.remove_by=%d, by which a pass has to end: none is removed so. Raise "
+                "the latter, or leave this step out", late, self.remove_by,
+            )  # fmt: skip
         pixels = min(frame.camera.width * frame.camera.height for frame in scene.train.frames)
         self.least = min(self.least, pixels // 2)
         if self.noise is None and self.floor > 0:
@@ -186,7 +192,8 @@ class Budget(DensityControl):
         """Steps from here to the next removal, 0 where it is now; None after the last one."""
         views = self.steps_of_pass
         last = (self.remove_by + 1) // views * views - 1
-        ends = [min((-(-begin // views) + 1) * views - 1, last) for begin in self.remove_at]
+        begins = [begin for begin in self.remove_at if begin <= self.remove_by]
+        ends = [min((-(-begin // views) + 1) * views - 1, last) for begin in begins]
         return min((end - step for end in ends if end >= step), default=None)
 
     def _scores(self, step: int) -> bool:

@@ -14,6 +14,8 @@ from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.same_bits import sigmoid
 from heatsplat.splats import Splats
 
+# Opacities of which a logit is finite in float32: those of 1, and those that no digits are left of, have none.
+NO_LIMIT = (1e-37, 1 - 2.0**-24)
 THINNER = 0.99  # largest shortest semi-axis of a child, of that along which its parent was split
 
 
@@ -34,12 +36,27 @@ class LongAxisSplit:
         along: factor on the longest semi-axis.
         across: factor on the other two.
         fade: factor on opacities.
+
+    Raises:
+        ValueError: offset is negative, along or across is not positive, fade is not in (0, 1], or one is not finite.
     """
 
     offset: float = 0.7
     along: float = 0.72
     across: float = 1.0
     fade: float = 0.74
+
+    def __post_init__(self) -> None:
+        if not (
+            0 <= self.offset < math.inf
+            and 0 < self.along < math.inf
+            and 0 < self.across < math.inf
+            and 0 < self.fade <= 1
+        ):
+            raise ValueError(
+                "density.split: offset must not be negative, along and across must be positive, all finite, and fade must lie in "
+                f"(0, 1], got {self.offset}, {self.along}, {self.across} and {self.fade}"
+            )
 
 
 @dataclass
@@ -183,7 +200,7 @@ class Cloud:
         scales += torch.full_like(scales, math.log(how.across)).scatter_(1, longest, math.log(how.along))
         own, limit = scales.gather(1, shortest), scales.gather(1, longest) + math.log(THINNER)
         scales.scatter_(1, shortest, torch.where(shortest == longest, own, own.minimum(limit)))
-        rows["opacity_logits"] = torch.logit(how.fade * sigmoid(rows["opacity_logits"]))
+        rows["opacity_logits"] = torch.logit((how.fade * sigmoid(rows["opacity_logits"])).clamp(*NO_LIMIT))
         for name in ("log_scales", "opacity_logits"):
             self.splats[name][ids] = rows[name]
         self.splats["means"][ids] = rows["means"] + aside
