@@ -6,6 +6,7 @@ float32 and in float64: tests ask for those that other tests have.
 
 import io
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -155,6 +156,13 @@ def test_shadows_of_a_sun_that_never_rises_change_nothing(solution):
     torch.testing.assert_close(
         model.temperature(splats, 12 * HOUR), plain.temperature(open_splats, 12 * HOUR), atol=1e-4, rtol=0
     )
+
+
+def test_by_night_nothing_is_sunlit():
+    """The map of it showed what the first sun of the record reaches."""
+    model, splats = ready(shadows=True)
+    assert model.attributes(splats, Query(time_s=12 * HOUR))["sunlit"].tolist() == [1.0] * 6
+    assert model.attributes(splats, Query(time_s=0.0))["sunlit"].tolist() == [0.0] * 6
 
 
 def test_effects_that_are_off_or_unknown_are_absent():
@@ -528,6 +536,14 @@ def test_shares_that_few_images_tell_do_not_learn_faster_in_shorter_runs(options
     paced = {name: item.paced for name, item in model.per_gaussian(seeds).items()}
     assert paced["raw_share"] is paced["raw_wind"] is follow
     assert paced["log_rate"] and paced["raw_sun"]
+
+
+def test_a_weather_with_far_more_wind_than_training_had_is_warned_of(caplog):
+    model, _ = ready()
+    model.under(replace(weather(), wind_m_s=2.0 * weather().wind_m_s))
+    assert not caplog.text
+    model.under(replace(weather(), wind_m_s=4.0 * weather().wind_m_s))
+    assert re.search(r"m/s of wind in the mean, and training had [0-9.]+: images did not tell", caplog.text)
 
 
 @pytest.mark.parametrize("solution", ["linear", "corrected"])

@@ -319,7 +319,11 @@ class EnergyBalance(ThermalModel):
             values["sky_open"] = surface.exposure.sky
         if surface.exposure.sun is not None and query.time_s is not None:
             sample, _ = interval_of(self.climate.drivers.times_s, query.time_s)
-            values["sunlit"] = surface.exposure.sun[:, self.climate.slots[sample]]
+            lit = surface.exposure.sun[:, self.climate.slots[sample]]
+            shines = bool(
+                (self.climate.drivers.beams[sample : sample + 2] != 0).any()
+            )  # by night no direction is asked
+            values["sunlit"] = lit if shines else torch.zeros_like(lit)
         if surface.share is not None:
             exchange = self._radiation() / surface.share
             values["radiation_share"] = surface.share

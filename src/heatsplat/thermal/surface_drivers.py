@@ -22,6 +22,7 @@ from heatsplat.thermal.weather_drive import NO_CLOUDS
 
 log = logging.getLogger(__name__)
 
+STRONGER = 3.0  # times the wind of training from which on another weather is warned of
 FAR_DEGREES = 5.0  # from the nearest sun whose shadows are known: three weeks of a year, or twenty minutes
 
 
@@ -184,6 +185,12 @@ def _wind(weather: Weather, options: BalanceOptions, mean_wind: float) -> Contri
     if mean_wind > 0:
         if weather.wind_m_s is None:
             raise SceneError("the model was trained with wind, but this weather has no wind_m_s; add it")
+        here = float(driver_means(weather.times_s, weather.wind_m_s))
+        if here > STRONGER * mean_wind:
+            log.warning(
+                "this weather has %.3g m/s of wind in the mean, and training had %.3g: images did not tell what so much does, "
+                "and surfaces follow the air as learned in less", here, mean_wind,
+            )  # fmt: skip
         recorded = f"recorded, {mean_wind:.3g} m/s in the mean"
         return Contribution({"wind_anomaly": weather.wind_m_s / mean_wind - 1}, {"convection": {"wind": recorded}})
     blows = weather.wind_m_s is not None and bool((weather.wind_m_s > 0).any())
