@@ -11,12 +11,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
 from heatsplat.contracts import SceneError, check_numbers
 from heatsplat.datamodules.formats.colmap_library import pycolmap
+from heatsplat.datamodules.formats.images import read_grey
 
 WEIGHTS = ("aliked-n16.pth", "aliked_lightglue.pth")
 DESCRIPTOR = 128  # numbers of a descriptor of ALIKED
@@ -99,7 +99,7 @@ class Aliked(Features):
     def extract(self, database: Path, images: Path, name: str, reader: pycolmap.ImageReaderOptions) -> None:
         pycolmap.Database.open(database).close()  # which has to be there
         pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, [name], reader)
-        grey = cv2.imread(str(images / name), cv2.IMREAD_GRAYSCALE)
+        grey = read_grey(images / name)
         image = torch.from_numpy(grey).float()[None, None] / 255.0
         with torch.no_grad():
             found = self._networks[0](image)[0]

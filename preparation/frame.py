@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -97,6 +98,13 @@ class ThermalFrame:
 
 
 def frame_name(path: Path, folder: Path, number: int | None = None) -> str:
-    """Name of a frame by its path below the folder of the recording, and by its number where the file holds several."""
+    """Name of a frame by its path below the folder of the recording, and by its number where the file holds several.
+
+    It is text: of a path that is not UTF-8, as archives of older systems leave them, by Windows' own encoding.
+    """
     stem = path.relative_to(folder).with_suffix("").as_posix().replace("/", "_")
+    try:
+        stem.encode()
+    except UnicodeEncodeError:
+        stem = os.fsencode(stem).decode("cp1252", "replace")
     return stem if number is None else f"{stem}_{number:06d}"

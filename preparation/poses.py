@@ -22,7 +22,7 @@ from heatsplat.contracts import SceneError, check_numbers, check_option, counted
 from heatsplat.datamodules.formats.colmap import pose_matrix
 from heatsplat.datamodules.formats.colmap_library import pycolmap
 from heatsplat.datamodules.formats.geodesy import east_north_up
-from heatsplat.datamodules.formats.images import ImageIndex, read_image, to_grey
+from heatsplat.datamodules.formats.images import ImageIndex, read_grey, read_image, to_grey
 from heatsplat.datamodules.formats.lens import MODELS
 from heatsplat.io.files import write_atomically
 from heatsplat.physics.radiometry import Conditions
@@ -529,7 +529,7 @@ class Search:
     def _stands_still(self) -> bool:
         """Whether images hardly move from frame to frame (phase correlation, Kuglin and Hines 1975)."""
         few = [list(self.copy_of.values())[i] for i in evenly_spread(len(self.copy_of), 9)]
-        copies = [cv2.imread(str(self.work / "images" / copy), cv2.IMREAD_GRAYSCALE).astype(np.float32) for copy in few]
+        copies = [read_grey(self.work / "images" / copy).astype(np.float32) for copy in few]
         moved = [np.hypot(*cv2.phaseCorrelate(a, b)[0]) for a, b in pairwise(copies) if a.shape == b.shape]
         return bool(moved) and float(np.median(moved)) < STILL_PX
 
@@ -570,7 +570,7 @@ def _apparent(frame: ThermalFrame) -> ThermalFrame:
 
 
 def _shape(path: Path) -> tuple[int, int]:
-    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).shape
+    return read_grey(path).shape
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:

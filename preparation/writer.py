@@ -22,7 +22,7 @@ import torch
 from heatsplat.contracts import SceneError, evenly_spread
 from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE, WORLD_FILE
-from heatsplat.datamodules.formats.images import SUFFIXES
+from heatsplat.datamodules.formats.images import SUFFIXES, read_grey
 from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.datamodules.timestamps import instant
 from heatsplat.doctor.base import some
@@ -84,7 +84,7 @@ class Writer:
         """The record of a frame, and whether its image had to be written."""
         record_file, made_of = self.images / f"{frame.name}.json", self._made_of(frame)
         done = read_json_object(record_file) or {}
-        mask = cv2.imread(str(self._mask_of(image_name(frame))), cv2.IMREAD_GRAYSCALE)
+        mask = read_grey(self._mask_of(image_name(frame)))
         if mask is not None and np.count_nonzero(mask == 0) != done.get("dead_pixels", 0):
             self.drawn[frame.name] = mask
         if done.get("made_of") == made_of and self.image_of(frame).exists():

@@ -65,6 +65,24 @@ def read_image(path: Path, page: int | None = None) -> np.ndarray:
     return np.ascontiguousarray(pixels)
 
 
+def read_grey(path: Path) -> np.ndarray | None:
+    """An image as greys [H, W] of 8 bits, by whatever name (``_in_utf8``); None where there is none."""
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError:
+        return None
+    return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+
+
+def _in_utf8(path: Path) -> bool:
+    """Whether a path is text: one that is not ends Python where OpenCV is given it."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def _only(path: Path) -> np.ndarray | None:
     try:
         data = path.read_bytes()
@@ -105,9 +123,11 @@ def _one_of(path: Path, page: int) -> np.ndarray | None:
     """
     try:
         about = path.stat()
-        if page == 0 or about.st_size > MOST_MAPPED:
+        if (page == 0 or about.st_size > MOST_MAPPED) and _in_utf8(path):
             found = cv2.imreadmulti(str(path), page, 1, flags=cv2.IMREAD_UNCHANGED)[1]
             return found[0] if found else None
+        if page == 0:
+            return cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
         places = _places_of_pages(path, about.st_size, about.st_mtime_ns)
         if page >= len(places):
             return None

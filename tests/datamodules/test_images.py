@@ -1,3 +1,4 @@
+import os
 import struct
 import unicodedata
 
@@ -14,6 +15,7 @@ from heatsplat.datamodules.formats.images import (
     ImageIndex,
     colour_levels,
     pages_of,
+    read_grey,
     read_image,
     resized,
     resized_mask,
@@ -234,3 +236,14 @@ def test_a_later_page_of_a_tiff_is_read_without_a_walk_through_those_before(tmp_
         read_image(tmp_path / "a.tiff", 4)
     with pytest.raises(SceneError, match="b.tiff cannot be read: No such file"):
         read_image(tmp_path / "b.tiff", 1)
+
+
+def test_files_whose_names_are_not_utf8_are_read(tmp_path):
+    """OpenCV's own readers end Python at such a name."""
+    for suffix in (".tiff", ".png"):
+        path = tmp_path / (os.fsdecode(b"Geb\xe4ude") + suffix)
+        pixels = np.arange(48, dtype=np.uint8).reshape(6, 8)
+        path.write_bytes(cv2.imencode(suffix, pixels)[1].tobytes())
+        for found in (read_image(path), read_image(path, 0), read_grey(path)):
+            assert np.array_equal(found, pixels)
+    assert read_grey(tmp_path / "none.png") is None

@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.physics.radiometry import Conditions
-from heatsplat.preparation.frame import ThermalFrame
+from heatsplat.preparation.frame import ThermalFrame, frame_name
 
 IMAGE = np.array([[10.0, 20.0], [np.nan, 30.0]], np.float32)
 
@@ -40,3 +41,10 @@ def test_counts_become_temperatures_by_their_calibration():
         "a", Path("a.png"), 0, load=lambda: counts, calibration=Calibration(scale=0.01, offset_c=-273.15)
     )
     np.testing.assert_allclose(frame.temperature(), [[20.0, 30.0]], atol=1e-4)
+
+
+def test_a_name_that_is_no_text_becomes_one(tmp_path):
+    """OpenCV ended Python at such a path, and pictures failed at such a name."""
+    path = tmp_path / os.fsdecode(b"Geb\xe4ude") / "a_1.tiff"
+    assert frame_name(path, tmp_path) == "Gebäude_a_1"
+    assert frame_name(tmp_path / "Straße 1.tiff", tmp_path, 3) == "Straße 1_000003"
