@@ -359,6 +359,9 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     cameras = listed.in_scene(trained.scene)
     frames = shot_frames(trained.scene, **shot, finer=trained.module.supersample, cameras=cameras)
     warn_beyond_record(trained.scene, frames, trained.module.thermal.beyond_record)
+    if "clean" in names and "clean" not in trained.image_names:
+        log.info("images=clean: no sensor changes what is rendered, so that recorded images are clean")
+        names = list(dict.fromkeys("recorded" if name == "clean" else name for name in names))
     for name in names:
         check_option("images", name, ("all", *trained.image_names), SceneError)
     names = trained.image_names if "all" in names else names

@@ -76,15 +76,15 @@ def test_another_table_is_what_model_and_frames_see(monkeypatch, tmp_path):
     assert seen[0].environment.air_c == pytest.approx(seen[0].time_s / HOUR_S)
 
 
-@pytest.mark.parametrize("images", ["recorded", "[recorded]", "all", "[all]"])
+@pytest.mark.parametrize("images", ["recorded", "[recorded]", "all", "[all]", "clean", "[recorded,clean]"])
 def test_one_image_is_named_as_a_list_of_it_is(monkeypatch, tmp_path, images):
     shoot(monkeypatch, tmp_path, {"weather"}, "trajectory=train", f"images={images}")
-    assert {path.name for path in tmp_path.iterdir()} == {"tiff", "frames.csv"}
+    assert {path.name for path in tmp_path.iterdir()} == {"tiff", "frames.csv"}  # without a sensor all images are clean
 
 
 def test_an_image_that_the_model_lacks_is_named(monkeypatch, tmp_path):
-    with pytest.raises(SceneError, match="images must be one of all, recorded, got 'clean'"):
-        shoot(monkeypatch, tmp_path, {"weather"}, "trajectory=train", "images=clean")
+    with pytest.raises(SceneError, match="images must be one of all, recorded, got 'rgb'"):
+        shoot(monkeypatch, tmp_path, {"weather"}, "trajectory=train", "images=rgb")
 
 
 def test_intervals_do_not_follow_from_images_of_another_weather(monkeypatch, tmp_path):
