@@ -72,7 +72,8 @@ class Budget(DensityControl):
         views: steps before an event over which the score is summed.
         floor: errors up to so many standard deviations of the noise do not count; 0 counts all.
         noise: that standard deviation in image units; None estimates it from the training images.
-        least_pixels: Gaussians wrong on fewer pixels than this, over all views of the score, are not split.
+        least_pixels: Gaussians wrong on fewer pixels than this, as training renders them (``supersample``), over all views of the
+            score, are not split.
         prune_opacity: Gaussians below this opacity (in every modality) are removed at events.
         remove_at: steps from which on a pass of the views tells which Gaussians they hardly show; those leave after it.
         remove_by: last step of such a pass, so that the others can settle; shorter than a pass, none are removed so.
