@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, number_in
 
 
 def _named(word: str, letter: str) -> re.Pattern[str]:
@@ -82,13 +82,6 @@ def mapping(values: Any, where: str) -> dict[str, Any]:
     if not isinstance(values, dict | None):
         raise SceneError(f"{where} must hold keys and values in braces {{...}}, it holds {shortened(values)}")
     return values or {}
-
-
-def number_in(text: str) -> float:
-    """The number that a text is. Raises ValueError for anything else, as for 1_5, which Python takes for 15."""
-    if "_" in text:
-        raise ValueError(f"could not convert string to float: {text!r}")
-    return float(text)
 
 
 def finite(value: Any, where: str, what: str = "a number") -> float:

@@ -9,8 +9,8 @@ from datetime import UTC, datetime, tzinfo
 from pathlib import Path, PurePosixPath
 from zoneinfo import ZoneInfo
 
-from heatsplat.contracts import SceneError
-from heatsplat.datamodules.side_files import number_in, read_table
+from heatsplat.contracts import SceneError, number_in
+from heatsplat.datamodules.side_files import read_table
 from heatsplat.physics.units import DAY_S
 
 DJI_NAME = re.compile(r"DJI_(\d{14})_\d+_[A-Z]")

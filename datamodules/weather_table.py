@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from heatsplat.contracts import RAIN, WEATHER_COLUMNS, SceneError, Weather
-from heatsplat.datamodules.side_files import number_in, read_table
+from heatsplat.contracts import RAIN, WEATHER_COLUMNS, SceneError, Weather, number_in
+from heatsplat.datamodules.side_files import read_table
 from heatsplat.datamodules.sun import cover_of
 from heatsplat.datamodules.timestamps import zone_of
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from heatsplat.errors import SceneError, check_count, check_numbers, check_option, rounded
+from heatsplat.errors import SceneError, check_count, check_numbers, check_option, number_in, rounded
 
 
 def test_an_option_that_there_is_not_is_told_those_that_there_are():
@@ -50,3 +50,9 @@ def test_large_numbers_of_messages_have_no_powers_of_ten():
         "0.051", "10", "49", "130", "-1,200,000", "inf",
     ]  # fmt: skip
     assert rounded(99.7, 2) == "100" and rounded(999.7, 3) == "1,000"
+
+
+def test_underscores_within_digits_make_no_number():
+    assert number_in(" 1e1 ") == 10.0
+    with pytest.raises(ValueError, match="'1_5'"):
+        number_in("1_5")

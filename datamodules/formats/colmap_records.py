@@ -11,9 +11,8 @@ from itertools import takewhile
 from pathlib import Path
 from struct import Struct, error
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, number_in
 from heatsplat.datamodules.formats.colmap_library import pycolmap
-from heatsplat.datamodules.side_files import number_in
 
 PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 REMEDY = "copy the model or export it from COLMAP again"

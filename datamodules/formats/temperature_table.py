@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from heatsplat.contracts import SceneError
-from heatsplat.datamodules.side_files import number_in, says_fahrenheit
+from heatsplat.contracts import SceneError, number_in
+from heatsplat.datamodules.side_files import says_fahrenheit
 
 SUFFIX = ".csv"
 MIN_SIDE = 16  # pixels: smaller tables are no images

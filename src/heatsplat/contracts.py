@@ -23,7 +23,16 @@ import torch
 from torch import Tensor
 
 # Also under this name, for packages that need torch anyway; what must start without it imports heatsplat.errors.
-from heatsplat.errors import SceneError, check_count, check_numbers, check_option, counted, is_number, rounded  # noqa: F401
+from heatsplat.errors import (  # noqa: F401
+    SceneError,
+    check_count,
+    check_numbers,
+    check_option,
+    counted,
+    is_number,
+    number_in,
+    rounded,
+)
 
 SHARE_OF_RANGE = "share of the image's range"  # unit of a course in image units
 AT_ONE_PLACE = 1e-3  # radius of cameras in distances from what they see, below which it moves by about a pixel at most

@@ -43,6 +43,13 @@ def check_count(name: str, value: Any, least: int = 1) -> None:
         raise SceneError(f"{name} must be a whole number, {least} or more, got {value}")
 
 
+def number_in(text: str) -> float:
+    """The number that a text is. Raises ValueError for anything else, as for 1_5, which Python takes for 15."""
+    if "_" in text:
+        raise ValueError(f"could not convert string to float: {text!r}")
+    return float(text)
+
+
 def counted(number: int, what: str) -> str:
     """A number with its noun for messages: "1 frame", "10 frames"."""
     return f"{number} {what}{'' if number == 1 else 's'}"

@@ -58,6 +58,7 @@ def test_curves_of_pixels_are_those_that_their_frame_shows_there(tmp_path):
         ("x,y,z\n", "points.csv has no point"),
         ("x,y,z\n1,2,warm\n", "points.csv, row 1: z is 'warm', a number is needed"),
         ("x,y,z\n1,2,\n", "points.csv, row 1: z is '', a number is needed"),
+        ("x,y,z\n1,2,1_5\n", "points.csv, row 1: z is '1_5', a number is needed"),
         ("x,y,z\n1,2,nan\n", "points.csv, row 1: z is 'nan', a number is needed"),
         ("x,y,z\n1,2,3,4\n", "points.csv, row 1: 4 cells for 3 columns"),
         ("name,x,y,z\na,1,2,3\na,1,2,4\n", "points.csv has two points called 'a'"),

@@ -2,8 +2,8 @@
 
 import pytest
 
-from heatsplat.contracts import SceneError
-from heatsplat.datamodules.side_files import finite, number_in, read_table, says_fahrenheit, says_kelvin
+from heatsplat.contracts import SceneError, number_in
+from heatsplat.datamodules.side_files import finite, read_table, says_fahrenheit, says_kelvin
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, number_in
 
 OPTION = "callbacks.probes.points"
 PLACE, PIXEL = ("x", "y", "z"), ("view", "row", "column")
@@ -108,7 +108,7 @@ def _rows(path: Path | str) -> list[dict[str, str]]:
 
 def _number(row: dict[str, str], key: str, where: str) -> float:
     try:
-        number = float(row[key].replace(",", "."))
+        number = number_in(row[key].replace(",", "."))
     except ValueError:
         number = float("nan")
     if not abs(number) < FARTHEST:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from heatsplat.contracts import Frame, SceneData, SceneError
+from heatsplat.contracts import Frame, SceneData, SceneError, number_in
 from heatsplat.export.formats.base import optional
 from heatsplat.export.moment import Moment
 from heatsplat.geometry.alignment import Similarity, similarity_between
@@ -299,7 +299,7 @@ def _positions(path: Path, flat: bool = False) -> dict[str, tuple[float, float, 
     name, *numbers = columns
     try:
         found = {
-            _without_ending(row[name]): tuple(float(_told(row, n).replace(",", ".")) for n in numbers)
+            _without_ending(row[name]): tuple(number_in(_told(row, n).replace(",", ".")) for n in numbers)
             for row in rows
             if all(_told(row, n) for n in columns)
         }
