@@ -393,7 +393,7 @@ def _unsettled(few: Sequence[tuple[Camera, Tensor]], points: Tensor) -> str:
     """What to say where views disagree on the normals of the same points; empty where they do not."""
     seen = []
     for camera, depth in few:
-        turn, found = camera.viewmat[:3, :3].double(), normals(camera, depth)
+        turn, found = camera.viewmat[:3, :3], normals(camera, depth)
         at, within = _pixels(camera, points)
         own = torch.full((len(points), 3), torch.nan, dtype=torch.float64)
         own[within] = found[at[:, 1], at[:, 0]] @ turn
@@ -462,7 +462,7 @@ def preparation_of(name: str, folders: Sequence[Path]) -> tuple[Response | None,
 
 def _write_cameras(target: Path, scene: SceneData, cameras: Mapping[str, Camera]) -> None:
     kinds, camera_of = pinholes(cameras)
-    poses = {name: camera.viewmat.double().numpy() for name, camera in cameras.items()}
+    poses = {name: camera.viewmat.numpy() for name, camera in cameras.items()}
     colours = scene.point_colors if scene.point_colors is not None else torch.full((len(scene.points), 3), 0.5)
     points = scene.points.double().numpy()
     write_model(target / "sparse" / "0", poses, kinds, points, _bytes(colours), camera_of=camera_of)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from heatsplat.geometry.projection import clamped_slopes, look_at, project_gaussians, to_camera, to_pixels
+from heatsplat.geometry.projection import clamped_slopes, look_at, project_gaussians, to_camera, to_pixels, to_world
 from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.training.rng import generator_for
 
@@ -44,6 +44,11 @@ def test_points_go_through_the_pinhole():
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, 3] = torch.tensor([1.0, 0.0, -2.0])
     assert to_camera(point, viewmat).tolist() == [[2.0, 2.0, 2.0]]
+
+
+def test_the_way_back_to_the_world():
+    means, _, _, viewmat, _ = scene()
+    torch.testing.assert_close(to_world(to_camera(means, viewmat), viewmat), means)
 
 
 def test_variances_and_whitening_are_those_of_the_covariance():

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, number_in
+from heatsplat.geometry.projection import to_world
 
 OPTION = "callbacks.probes.points"
 PLACE, PIXEL = ("x", "y", "z"), ("view", "row", "column")
@@ -43,8 +44,7 @@ class AskedPoint:
         if not depth < float("inf"):
             return None
         at = torch.tensor([self.column + 0.5, self.row + 0.5, 1.0], dtype=torch.float64)
-        local = depth * torch.linalg.solve(camera.K, at)
-        return (local - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+        return to_world(depth * torch.linalg.solve(camera.K, at), camera.viewmat)
 
 
 def asked_points(path: Path | str, scene: SceneData) -> list[AskedPoint]:

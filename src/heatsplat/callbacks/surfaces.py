@@ -189,8 +189,8 @@ def _marked(one: Look, shown: Sequence[tuple[str, tuple[float, float]]], low: fl
 
 def _place(one: Look, point: Tensor) -> tuple[float, float] | None:
     """Column and row of a point of a surface in a look that sees it."""
-    local = to_camera(point[None], one.camera.viewmat.double())
-    column, row = to_pixels(local, one.camera.K.double())[0].tolist()
+    local = to_camera(point[None], one.camera.viewmat)
+    column, row = to_pixels(local, one.camera.K)[0].tolist()
     if local[0, 2] <= 0 or not (0 <= column < one.camera.width and 0 <= row < one.camera.height):
         return None
     there = one.depth[int(row), int(column)].item()

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.contracts import Camera, SceneData, View, evenly_spread
-from heatsplat.geometry.projection import to_camera
+from heatsplat.geometry.projection import to_camera, to_world
 from heatsplat.physics.noise import noise_of, quantum_of
 
 log = logging.getLogger(__name__)
@@ -108,12 +108,11 @@ def _swept(
     at = (
         torch.stack([(order % across)[:, None] + right.flatten(), (order // across)[:, None] + down.flatten()], 2) + 0.5
     )
-    matrix, viewmat = camera.K.double(), camera.viewmat.double()
     pixels = torch.cat([_block(camera) * at, torch.ones_like(at[..., :1])], 2)
-    rays = torch.linalg.solve(matrix, pixels[..., None])[..., 0]
-    away = float((middle - camera.center.double()).norm())
+    rays = torch.linalg.solve(camera.K, pixels[..., None])[..., 0]
+    away = float((middle - camera.center).norm())
     depths = 1.0 / torch.linspace(1.0 / (FARTHEST * away), 1.0 / (NEAREST * away), DEPTHS, dtype=torch.float64)
-    scores = torch.stack([_alike(own, rays, depths, viewmat, cameras[i], images[i]) for i in others])
+    scores = torch.stack([_alike(own, rays, depths, camera.viewmat, cameras[i], images[i]) for i in others])
     seen = scores.isfinite()
     half = scores.nan_to_num(-1.0).sort(dim=0, descending=True).values[: len(others) // 2 + 1]  # others may be hidden
     score = torch.where(seen.sum(0) > len(others) // 2, half.mean(0), -1.0)  # [n, D]
@@ -127,16 +126,15 @@ def _swept(
     shift = 0.5 * (before - after) / (before - 2.0 * peak + after).clamp_max(-1e-9)  # of a parabola's top
     nearness = 1.0 / depths[place] + shift * (1.0 / depths[1] - 1.0 / depths[0])
     local = rays[kept, side * side // 2] / nearness[:, None]
-    return (local - viewmat[:3, 3]) @ viewmat[:3, :3]
+    return to_world(local, camera.viewmat)
 
 
 def _alike(own: Tensor, rays: Tensor, depths: Tensor, viewmat: Tensor, camera: Camera, image: Tensor) -> Tensor:
     """Correlation [n, D] of patches ``own`` [n, q] with what an image shows where they would lie at each depth; nan outside."""
     points = rays[:, None] * depths[:, None, None]  # [n, D, q, 3]
-    world = (points - viewmat[:3, 3]) @ viewmat[:3, :3]
-    local = to_camera(world.flatten(0, 2), camera.viewmat.double())
+    local = to_camera(to_world(points, viewmat).flatten(0, 2), camera.viewmat)
     ahead = local[:, 2] > 1e-6
-    pixels = (local @ camera.K.double().T)[:, :2] / local[:, 2:].clamp_min(1e-6)
+    pixels = (local @ camera.K.T)[:, :2] / local[:, 2:].clamp_min(1e-6)
     height, width = image.shape
     positions = 2.0 * pixels / (_block(camera) * pixels.new_tensor([width, height])) - 1.0
     inside = (ahead & (positions.abs() < 1.0).all(1)).view(points.shape[:3]).all(2)

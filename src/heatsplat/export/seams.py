@@ -42,8 +42,8 @@ def mosaic(scene: SceneData, points: Tensor) -> tuple[np.ndarray, np.ndarray]:
         if view.thermal is None:
             raise SceneError(f"what.against compares temperatures, and scene '{scene.name}' has no thermal images")
         camera, image = view.camera, view.thermal[..., 0].double()
-        local = to_camera(points.reshape(-1, 3), camera.viewmat.double()).view(*shape, 3)
-        place = to_pixels(local.reshape(-1, 3), camera.K.double()).view(*shape, 2).nan_to_num(-1)
+        local = to_camera(points.reshape(-1, 3), camera.viewmat).view(*shape, 3)
+        place = to_pixels(local.reshape(-1, 3), camera.K).view(*shape, 2).nan_to_num(-1)
         column, row = place.floor().clamp(-1, 1e6).long().unbind(-1)
         inside = (local[..., 2] > 0) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
         row, column = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)

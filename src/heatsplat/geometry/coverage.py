@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from heatsplat.contracts import Camera
-from heatsplat.geometry.projection import to_camera, to_pixels
+from heatsplat.geometry.projection import to_camera, to_pixels, to_world
+from heatsplat.geometry.sight_lines import rays
 
 OPEN = 0.5  # a pixel with less opacity than this shows no surface, but what is far behind everything
 DEPTH_TOLERANCE = 0.05  # of the depth: what lies so little behind a surface belongs to it
@@ -82,19 +83,14 @@ def covered(camera: Camera, depth: Tensor, sightings: Sequence[Sighting]) -> Ten
         depth: [H, W] of the new view, as ``surface_depth`` gives it.
         sightings: of the training cameras.
     """
-    rows, columns = torch.meshgrid(
-        torch.arange(camera.height, dtype=torch.float64), torch.arange(camera.width, dtype=torch.float64), indexing="ij"
-    )
-    pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones_like(rows)], dim=-1).reshape(-1, 3)
-    rays = pixels @ torch.linalg.inv(camera.K).T
     z = depth.detach().cpu().double().reshape(-1)
     is_open = z.isinf()
     order, apart = _by_likeness(camera, [sighting.camera for sighting in sightings])
-    points = (rays * torch.where(is_open, FAR * max(apart, 1.0), z)[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[
-        :3, :3
-    ]
+    reach = torch.where(is_open, FAR * max(apart, 1.0), z)
+    points = to_world(rays(camera).reshape(-1, 3) * reach[:, None], camera.viewmat)
 
     # Most of what is never found lies in few images, such as sky: to look for it in all takes seconds (700 images).
+    rows, columns = torch.arange(camera.height)[:, None], torch.arange(camera.width)
     tiles = (rows // TILE * (camera.width // TILE + 1) + columns // TILE).reshape(-1)
     tiles = torch.where(is_open, -1 - tiles, tiles)  # sky and surfaces of a tile are far apart
     left = tiles.argsort(stable=True)  # not found yet, tile by tile
@@ -144,7 +140,7 @@ def _sides(camera: Camera) -> Tensor:
     """Planes [5, 4] that bound what a camera sees: left, right, top, bottom and its own; (x, y, z, 1) of it is not below 0."""
     (fx, cx), (fy, cy) = ((float(camera.K[i, i]), float(camera.K[i, 2])) for i in (0, 1))
     inward = [[fx, 0, cx], [-fx, 0, camera.width - cx], [0, fy, cy], [0, -fy, camera.height - cy], [0, 0, 1]]
-    return torch.tensor(inward, dtype=torch.float64) @ camera.viewmat[:3].double()
+    return torch.tensor(inward, dtype=torch.float64) @ camera.viewmat[:3]
 
 
 def _by_likeness(camera: Camera, others: Sequence[Camera]) -> tuple[list[int], float]:
@@ -165,10 +161,9 @@ def _sees(sighting: Sighting, points: Tensor, is_open: Tensor) -> Tensor:
     """Which of the points [P, 3] a training camera sees, [P] bool; ``is_open`` [P] tells which stand for directions."""
     camera = sighting.camera
     local = to_camera(points, camera.viewmat)
-    column, row = to_pixels(local, camera.K).unbind(-1)
-    inside = (local[:, 2] > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    ids = inside.nonzero().squeeze(1)
-    row, column = row[ids].long(), column[ids].long()
+    pixels = to_pixels(local, camera.K)
+    ids = camera.inside(pixels, local[:, 2]).nonzero().squeeze(1)
+    column, row = pixels[ids].long().unbind(-1)
     # The farthest of the pixel and its neighbours: at an edge the coarse grid cannot tell them apart. A direction must be
     # free in all of them: holes between Gaussians, and the ragged end of what is reconstructed, have some open pixels.
     nearest, farthest = sighting.around

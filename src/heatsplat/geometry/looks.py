@@ -10,7 +10,8 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera
 from heatsplat.geometry.coverage import DEPTH_TOLERANCE
-from heatsplat.geometry.projection import to_camera, to_pixels
+from heatsplat.geometry.projection import to_camera, to_pixels, to_world
+from heatsplat.geometry.sight_lines import rays
 
 GRAZING = 0.1  # cosine between a surface's normal and the way to a camera below which that sees nothing of it
 
@@ -44,19 +45,16 @@ class Look:
     def _places(self, points: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
         """Of points [n, 3] whether they lie in the image, their camera z, and row and column, within the image."""
         camera = self.camera
-        local = to_camera(points.double(), camera.viewmat.double())
-        column, row = to_pixels(local, camera.K.double()).floor().nan_to_num(-1).clamp(-1, 1e6).long().unbind(-1)
-        inside = (local[:, 2] > 0) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
-        return inside, local[:, 2], (row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1))
+        local = to_camera(points.double(), camera.viewmat)
+        pixels = to_pixels(local, camera.K)
+        column, row = pixels.nan_to_num(0).clamp(0, 1e6).long().unbind(-1)
+        place = row.clamp(max=camera.height - 1), column.clamp(max=camera.width - 1)
+        return camera.inside(pixels, local[:, 2]), local[:, 2], place
 
 
 def surface_points(camera: Camera, depth: Tensor) -> Tensor:
     """Points [H, W, 3] of the world, float64, at a depth (camera z, [H, W]) in the middle of each pixel of a camera."""
-    height, width = depth.shape
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones(height, width)], dim=-1).double()
-    local = pixels @ torch.linalg.inv(camera.K.double()).T * depth.double()[..., None]
-    return (local - camera.viewmat[:3, 3].double()) @ camera.viewmat[:3, :3].double()
+    return to_world(rays(camera) * depth.double()[..., None], camera.viewmat)
 
 
 def values_at(looks: Sequence[Look], points: Tensor, normals: Tensor | None = None) -> Tensor:
@@ -72,7 +70,7 @@ def values_at(looks: Sequence[Look], points: Tensor, normals: Tensor | None = No
     sums, weights = torch.zeros(2, len(points), dtype=torch.float64)
     for look in looks:
         seen, values = look.sees(points)
-        way = look.camera.center.double() - points.double()
+        way = look.camera.center - points.double()
         distance = way.norm(dim=1).clamp(min=1e-12)
         cosine = 1.0 if normals is None else (way * normals.double()).sum(1) / distance
         if normals is not None:

@@ -38,6 +38,19 @@ def to_camera(points: Tensor, viewmat: Tensor) -> Tensor:
     return points @ viewmat[:3, :3].T + viewmat[:3, 3]
 
 
+def to_world(points: Tensor, viewmat: Tensor) -> Tensor:
+    """Points in the world [..., 3] of points in camera axes [..., 3]."""
+    return (points - viewmat[:3, 3]) @ viewmat[:3, :3]
+
+
+def view_matrix(rotation: Tensor, eye: Tensor) -> Tensor:
+    """World-to-camera matrix [4, 4] of a camera at ``eye`` [3] whose axes are the rows of ``rotation`` [3, 3]."""
+    viewmat = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ eye
+    return viewmat
+
+
 def to_pixels(points: Tensor, K: Tensor) -> Tensor:
     """Pixel coordinates [..., 2] of points in camera axes [..., 3] whose z is not zero."""
     focal = torch.stack([K[0, 0], K[1, 1]])
@@ -62,11 +75,7 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
             f"{eye.tolist()}, target {target.tolist()}, up {up.tolist()}"
         )
     forward, right = forward / forward.norm(), right / right.norm()
-    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    viewmat = torch.eye(4, dtype=eye.dtype, device=eye.device)
-    viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -rotation @ eye
-    return viewmat
+    return view_matrix(torch.stack([right, torch.linalg.cross(forward, right), forward]), eye)
 
 
 def clamped_slopes(points: Tensor, K: Tensor, width: int, height: int, margin: float) -> Tensor:

@@ -20,7 +20,7 @@ def rays(camera: Camera) -> Tensor:
         torch.arange(camera.height, dtype=torch.float64), torch.arange(camera.width, dtype=torch.float64), indexing="ij"
     )
     pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones_like(rows)], dim=-1)
-    return pixels @ torch.linalg.inv(camera.K.double()).T
+    return pixels @ torch.linalg.inv(camera.K).T
 
 
 def distances(camera: Camera, depth: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera
-from heatsplat.geometry.projection import look_at
+from heatsplat.geometry.projection import look_at, view_matrix
 from heatsplat.geometry.rotations import matrices_to_quats, quats_to_matrices, slerp
 
 ONE_SIDED = (
@@ -77,10 +77,7 @@ def interpolate(cameras: Sequence[Camera], count: int) -> list[Camera]:
     for t in torch.linspace(0, len(cameras) - 1, count, dtype=torch.float64).tolist():
         i = min(int(t), len(cameras) - 2)
         u = t - i
-        rotation = quats_to_matrices(slerp(quats[i], quats[i + 1], u))
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3] = rotation
-        viewmat[:3, 3] = -rotation @ _catmull_rom(centres, i, u)
+        viewmat = view_matrix(quats_to_matrices(slerp(quats[i], quats[i + 1], u)), _catmull_rom(centres, i, u))
         path.append(Camera(viewmat, torch.lerp(intrinsics[i], intrinsics[i + 1], u), width, height))
     return path
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from heatsplat.contracts import Camera, SceneData
 from heatsplat.geometry.coverage import surface_depth
 from heatsplat.geometry.exposure import open_share, sky_directions, sun_directions
+from heatsplat.geometry.projection import view_matrix
 from heatsplat.renderers.settings import Renderer
 from heatsplat.thermal.base import SKY_SEEN, SUN_SEEN
 from heatsplat.training.normals import Discs
@@ -134,9 +135,7 @@ class Exposure:
         helper = torch.eye(3, dtype=torch.float64)[int(away.abs().argmin())]
         right = torch.nn.functional.normalize(torch.linalg.cross(away, helper), dim=0)
         turn = torch.stack([right, torch.linalg.cross(-away, right), -away])
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3] = turn
-        viewmat[:3, 3] = -turn @ (centre.double() + DISTANCE * radius * away)
+        viewmat = view_matrix(turn, centre.double() + DISTANCE * radius * away)
         focal = 0.5 * self.side * DISTANCE
         half = 0.5 * self.side
         K = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]], dtype=torch.float64)

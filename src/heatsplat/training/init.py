@@ -404,10 +404,8 @@ def looks_at(scene: SceneData, points: Tensor, modality: str, channels: int) -> 
         view = scene.train[position]
         image, camera = view.image(modality), view.camera
         pixels, depths = camera.project(points)
-        column, line = pixels.floor().unbind(1)
-        seen = (depths > 0) & (column >= 0) & (column < camera.width) & (line >= 0) & (line < camera.height)
-        ids = seen.nonzero().squeeze(1)
-        at_line, at_column = line[ids].long(), column[ids].long()
+        ids = camera.inside(pixels, depths).nonzero().squeeze(1)
+        at_column, at_line = pixels[ids].long().unbind(1)
         if view.mask is not None:
             valid = view.mask[at_line, at_column]
             ids, at_line, at_column = ids[valid], at_line[valid], at_column[valid]

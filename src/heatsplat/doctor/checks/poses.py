@@ -8,6 +8,7 @@ from torch.nn import functional
 
 from heatsplat.contracts import Camera, evenly_spread
 from heatsplat.doctor.base import Check, Finding, Material, some, unit
+from heatsplat.geometry.projection import to_world
 
 PAIRS, POINTS, CANDIDATES = 10, 100, 1500
 HALF, REACH = 4, 5  # pixels: half a patch, and how far a point is looked for about where it should be
@@ -97,8 +98,7 @@ def _shifts(material: Material, one: int, other: int, points: Tensor) -> tuple[f
         torch.linalg.solve(camera.K, functional.pad(pixels[:, None] + patch, (0, 1), value=1.0).mT).mT
         * depth[:, None, None]
     )
-    world = (rays - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-    base = second.project(world.reshape(-1, 3))[0].reshape(len(keep), -1, 2)
+    base = second.project(to_world(rays, camera.viewmat).reshape(-1, 3))[0].reshape(len(keep), -1, 2)
     steps = torch.arange(-REACH, REACH + 1, dtype=torch.float64)
     moves = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).reshape(-1, 2)
     best, where = _alike(unit(first), material.image(other), base, moves).max(1)

@@ -20,6 +20,7 @@ from heatsplat.export.place import AUTO, Place, place_in_file
 from heatsplat.export.seams import comparison, mosaic, shift_between, smoothed
 from heatsplat.geometry.coverage import OPEN, covered, gap_free, seen_means, surface_depth
 from heatsplat.geometry.looks import surface_points
+from heatsplat.geometry.projection import view_matrix
 from heatsplat.io.pictures import IMAGE_VALUES, Bar, Panel, bounds_of, colorize, compose, enlarged, lettering, write_png
 from heatsplat.io.quantities import moment as said
 from heatsplat.shots import at_time, checked_unseen, deviations_told, first_free_id, sightings
@@ -289,9 +290,7 @@ def _from_above(
     eye = torch.tensor([west + 0.5 * pixel * width, north - 0.5 * pixel * height, ground + away], dtype=torch.float64)
     scale, rotation, shift = place.similarity
     turned = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)) @ rotation  # x east, y south, z down
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = turned
-    viewmat[:3, 3] = -turned @ (rotation.T @ (eye - shift) / scale)
+    viewmat = view_matrix(turned, rotation.T @ (eye - shift) / scale)
     focal = away / pixel
     K = torch.tensor([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]], dtype=torch.float64)
     return Camera(viewmat, K, width, height)
