@@ -26,7 +26,6 @@ from heatsplat.geometry.transforms import camera_entry
 log = logging.getLogger("heatsplat")
 
 SCENES, TRUTH = "scenes", "truth"  # the two folders: what is handed out, and what is not
-EARLIER = {"scene_seed": 0}  # what meta.json does not say in folders of earlier versions
 META = "meta.json"
 
 
@@ -68,8 +67,8 @@ def write_scenes(
         made_from = {"protocol": protocol["version"], **({"size": None} if name in (real or {}) else settings[name])}
         meta = target / SCENES / name / META
         if meta.exists():
-            before = EARLIER | json.loads(meta.read_text())
-            if changed := [key for key, value in made_from.items() if before.get(key, value) != value]:
+            before = json.loads(meta.read_text())
+            if changed := [key for key, value in made_from.items() if before.get(key) != value]:
                 raise SceneError(
                     f"{meta.parent} was written with another {' and '.join(changed)}: delete it, or give study.target another "
                     "folder"

@@ -51,14 +51,15 @@ class Target:
                 "outside of it"
             )
         record = read_json_object(self.folder / RECORD)
-        if not self._is_ours(record) and (foreign := self._first()) is not None:
+        ours = record is not None and record.get("made") == self.made
+        if not ours and (foreign := self._first()) is not None:
             raise SceneError(
                 f"{foreign} is of something else than a scene {self.made}, and would be replaced; give an empty folder as "
                 "target, or move it elsewhere"
             )
         place = self.folder / CAMERAS
         there = _digest(place)
-        own = there if record is None and self._has_older_cameras() else (record or {}).get("cameras")
+        own = (record or {}).get("cameras")
         if cameras and there not in (None, own):
             raise SceneError(
                 f"{place} holds cameras that no preparation wrote, or that were changed since, and they would be replaced; "
@@ -72,31 +73,6 @@ class Target:
 
     def _write(self, cameras: str | None) -> None:
         write_atomically(self.folder / RECORD, json.dumps({"made": self.made, "cameras": cameras}) + "\n")
-
-    def _is_ours(self, record: dict | None) -> bool:
-        if record is not None:
-            return record.get("made") == self.made
-        # Earlier versions left no record; their images have one each, and their corrected scenes a title.
-        if self.made == CORRECTED:
-            return f", {CORRECTED} by" in self._title()
-        records = (read_json_object(path) or {} for path in (self.folder / "images").glob("*.json"))
-        return (self.folder / PARTIAL).is_dir() or any("made_of" in record for record in records)
-
-    def _has_older_cameras(self) -> bool:
-        """Whether an earlier version, which left no record, wrote the cameras."""
-        if self.made == CORRECTED:
-            return self._is_ours(None)
-        names = {path.name for path in (self.folder / CAMERAS).glob("*")}
-        return (self.folder / WORK).is_dir() and names <= {
-            f"{name}.bin" for name in ("cameras", "images", "points3D", "rigs", "frames")
-        }
-
-    def _title(self) -> str:
-        try:
-            with (self.folder / REPORT).open(encoding="utf-8") as file:
-                return file.readline().rstrip()
-        except (OSError, ValueError):
-            return ""
 
     def _first(self) -> Path | None:
         """A file that would be replaced, or None."""

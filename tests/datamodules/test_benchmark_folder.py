@@ -75,15 +75,6 @@ def test_a_coarse_camera_trains_on_less_than_is_asked_for(root):
     assert read_image(folder / train["thermal_file_path"]).shape == (13, 16)
 
 
-def test_a_folder_that_does_not_tell_its_seed_has_the_usual_one(tmp_path):
-    meta = tmp_path / "scenes" / "cooling" / "meta.json"
-    meta.parent.mkdir(parents=True)
-    meta.write_text(json.dumps({"protocol": 1, "size": "tiny"}))
-    write_scenes(tmp_path, PROTOCOL, scenes=["cooling"])
-    with pytest.raises(SceneError, match="was written with another scene_seed"):
-        write_scenes(tmp_path, PROTOCOL | {"scene_seed": 7}, scenes=["cooling"])
-
-
 def test_what_is_there_stays_and_another_size_is_refused(root, tmp_path):
     meta = root / "scenes" / "cooling" / "meta.json"
     before = meta.stat().st_mtime_ns

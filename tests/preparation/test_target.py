@@ -1,6 +1,5 @@
 """What lies in a folder is replaced only where a preparation wrote it."""
 
-import json
 import shutil
 
 import numpy as np
@@ -11,7 +10,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.colmap import write_model
 from heatsplat.preparation.prepare import prepare
 from heatsplat.preparation.report import Section
-from heatsplat.preparation.target import CORRECTED, PREPARED, RECORD, Target
+from heatsplat.preparation.target import CORRECTED, RECORD, Target
 
 pytestmark = pytest.mark.usefixtures("dots_for_pictures")
 PLAIN = {"conditions": {}, "uncertainty": {}, "counts": {}}
@@ -88,16 +87,6 @@ def test_cameras_that_are_not_found_anew_are_still_ours(tmp_path):
     prepare(str(source), scene, **PLAIN, poses=search)
 
 
-def test_what_earlier_versions_prepared_is_known_by_its_records(tmp_path):
-    source, scene = write_images(tmp_path / "files", IMAGES), tmp_path / "scene"
-    prepare(str(source), scene, **PLAIN, poses=search)
-    (scene / RECORD).unlink()
-    is_refused(source, scene, "sparse/0 holds cameras", poses=search)
-    (scene / ".poses").mkdir()  # which a search leaves
-    prepare(str(source), scene, **PLAIN, poses=search)
-    assert json.loads((scene / RECORD).read_text())["made"] == PREPARED
-
-
 def test_a_corrected_scene_is_no_target_of_a_preparation_nor_the_other_way_round(tmp_path):
     source, scene, other = write_images(tmp_path / "files", IMAGES), tmp_path / "scene", tmp_path / "other"
     prepare(str(source), scene, **PLAIN)
@@ -110,6 +99,3 @@ def test_a_corrected_scene_is_no_target_of_a_preparation_nor_the_other_way_round
     (other / RECORD).unlink()
     with pytest.raises(SceneError, match="is of something else"):
         Target(other, CORRECTED).claim()
-    # Of earlier versions, which left no record.
-    (other / "report.md").write_text("# other, corrected pixel by pixel by the trained scene a\n")
-    Target(other, CORRECTED).claim()

@@ -467,17 +467,6 @@ def test_where_the_exchange_is_given_nothing_absorbs_more_light_than_falls_on_it
     torch.testing.assert_close(black, torch.ones(6), rtol=1e-5, atol=0)
 
 
-def test_checkpoints_of_before_that_limit_show_what_they_did():
-    model, splats = ready(exchange="iso_6946")
-    before = model.state_dict()
-    del before["sun_limit"]
-    old, _ = ready(exchange="iso_6946")
-    old.load_state_dict(before)
-    sun = old.attributes(splats, Query(time_s=0.0))["sun_k_per_kw_m2"]
-    torch.testing.assert_close(sun, 200.0 * splats["raw_sun"].detach().sigmoid())
-    assert model.sun_limit < 100.0 and "sun_limit" not in EnergyBalance().state_dict()
-
-
 def test_a_record_of_still_air_has_the_convection_of_still_air():
     still = torch.zeros_like(weather().wind_m_s)
     for exchange, expected in (("iso_6946", 4.0), ([5.0, 2.5], 5.0)):
@@ -580,13 +569,3 @@ def test_in_another_weather_shadows_are_those_of_the_directions_that_were_looked
         lower = torch.nn.functional.normalize(record.sun + torch.tensor([0.0, -0.4, 0.0], dtype=torch.float64), dim=1)
         model.under(weather(sun=lower))
     assert "shadows are those of the sun where it stood during training, up to" in caplog.text
-
-
-def test_checkpoints_without_directions_of_the_sun_take_those_of_their_weather():
-    model, _ = ready(shadows=True)
-    before = model.sun_ways.clone()
-    state = model.state_dict()
-    del state["sun_ways"]
-    model.load_state_dict(state)
-    assert torch.equal(model.sun_ways, before)
-    assert "sun_ways" not in EnergyBalance().state_dict()

@@ -168,7 +168,7 @@ class BudgetClock(pl.Callback):
         return {"moved": self._moved}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._moved = state.get("moved")  # older states know other numbers
+        self._moved = state["moved"]
 
 
 def _least(schedule: Any) -> float:

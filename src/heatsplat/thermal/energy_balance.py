@@ -474,15 +474,6 @@ class EnergyBalance(ThermalModel):
             high = min(high, START_ABSORPTIVITY * self._sun_limit)
         return (loss / mean(light).clamp(min=1e-6)).clamp(low, high).to(grey)
 
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest) -> None:
-        """Checkpoints of before shadows kept their directions have those of their weather, and those of before the sun's limit
-        followed from the exchange have the limit of all; what torch does follows."""
-        if self.options.shadows:
-            state_dict.setdefault(prefix + "sun_ways", self.sun_ways)
-        if self._exchange_given:
-            state_dict.setdefault(prefix + "sun_limit", torch.full_like(self.sun_limit, SUN_LIMIT))
-        super()._load_from_state_dict(state_dict, prefix, *rest)
-
 
 def _live_on(model: EnergyBalance, _: Any) -> None:
     """Builds the tables anew after a checkpoint has brought the constants of its own weather."""

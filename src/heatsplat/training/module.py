@@ -478,7 +478,7 @@ class SplatTraining(SceneModel):
                 setattr(self.get_submodule(owner), leaf, torch.empty_like(given, device=buffer.device))
         own = checkpoint[CHECKPOINT_KEY]
         if self.schedule.load_state_dict(own["schedule"]):
-            self.density.load_times(own.get("density_times", {}))
+            self.density.load_times(own["density_times"])
             if "average" in own:  # of a run that goes on for longer, these updates are not the last ones
                 self._average.load_state_dict(own["average"], self.device)
         self._waiting = {name: own[name] for name in ("gradients", "unwritten") if name in own}
