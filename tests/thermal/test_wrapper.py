@@ -191,7 +191,7 @@ def test_no_hook_of_a_model_is_left_out():
         "inseparable",
         "stays_here",
     }
-    hooks -= own | {"opacity_channels"}  # which follows from others
+    hooks -= own | {"images", "opacity_channels"}  # which follow from others
     hooks -= {"rows", "per_row"}  # those of one Gaussian for each row: others cannot be wrapped
     assert hooks - made <= vars(Wrapper).keys()
     assert hooks - made <= vars(Probe).keys()

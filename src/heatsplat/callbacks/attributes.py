@@ -12,7 +12,7 @@ from torch import Tensor
 from heatsplat.callbacks.board import add_picture
 from heatsplat.callbacks.images import file_stem
 from heatsplat.contracts import Frame, SceneData, check_count, evenly_spread
-from heatsplat.io.pictures import Bar, Panel, colorize, compose, text_panel, write_png
+from heatsplat.io.pictures import Bar, Panel, bounds_of, colorize, compose, text_panel, write_png
 from heatsplat.io.quantities import impossible, words_and_unit
 from heatsplat.io.tables import write_csv
 from heatsplat.metrics.attribute_errors import attribute_errors
@@ -173,7 +173,7 @@ def attribute_picture(module: pl.LightningModule, frame: Frame) -> np.ndarray | 
         if not known.size:
             panels.append(text_panel(values.shape, title, "known nowhere"))
             continue
-        low, high = (float(x) for x in np.percentile(known, (0.1, 99.9)))
+        low, high = bounds_of(known)
         if high - low <= CONSTANT * max(abs(low), abs(high)):
             panels.append(text_panel(values.shape, title, f"{np.median(known):.4g} {unit}".rstrip() + " everywhere"))
         else:

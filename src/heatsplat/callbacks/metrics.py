@@ -231,7 +231,7 @@ class QualityMetrics(pl.Callback):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.curve = [dict(row) for row in state["curve"]]
-        self._losses, self._steps = state.get("losses", 0.0), state.get("steps", 0)  # files of 0.1.0 have none
+        self._losses, self._steps = state["losses"], state["steps"]
 
 
 def _scores_of(companion: str) -> tuple[str, ...]:

@@ -145,7 +145,7 @@ def beside(inspected: Inspection, course: Tensor) -> Known:
     # Twice: the first time, what multiplies an image is not yet linearised about one without the pattern.
     certainty = Certainty(fit.accepted(uneven).accepted(uneven), even)
     gain = certainty.compared(uneven, even)
-    shows = gain.db > LEAST_DB and gain.sigmas > MIN_SIGMAS
+    shows = gain.exceeds(LEAST_DB, MIN_SIGMAS)
     driven = uneven if shows else even
     still = driven.minus({NAME})
     camera, air = still.plus("frame_offset").plus("agc"), still.plus("attenuation", "varying")
@@ -156,7 +156,7 @@ def beside(inspected: Inspection, course: Tensor) -> Known:
 
 
 def _clear(gain: HeldOut) -> bool:
-    return gain.db > MIN_DB and gain.sigmas > MIN_SIGMAS
+    return gain.exceeds(MIN_DB, MIN_SIGMAS)
 
 
 def harmonics(inspected: Inspection, count: int) -> int:

@@ -10,6 +10,7 @@ from torch import Tensor
 from heatsplat.effects.observations import Observations, Tracks, between, slopes
 from heatsplat.geometry.motion import screen_velocity, twists
 from heatsplat.geometry.projection import to_camera
+from heatsplat.physics.noise import MAD_TO_SIGMA
 
 PLACED_PX = 0.2  # how well a point's place in an image is known
 OUTLIER = 5.0  # usual residuals away from which an observation counts nothing (Tukey's weights)
@@ -114,7 +115,7 @@ def _fitted(obs: Observations, columns: Tensor) -> tuple[Tensor, Tensor] | None:
             return None
         seconds = torch.linalg.solve(inner, torch.einsum("pf,pfi,pf->i", weights, about, values[..., 0]))
         left = values[..., 0] - about @ seconds
-        usual = 1.4826 * (left.abs() / errors)[seen].median().clamp_min(1e-9)
+        usual = MAD_TO_SIGMA * (left.abs() / errors)[seen].median().clamp_min(1e-9)
         weights = (1.0 - (left / (OUTLIER * usual * errors)) ** 2).clamp_min(0.0) ** 2 * tracks.weights / errors**2
     pulls = (weights * left)[..., None] * about
     inverse = torch.linalg.inv(inner)

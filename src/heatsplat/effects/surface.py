@@ -10,12 +10,12 @@ from torch.nn import functional
 from heatsplat.contracts import evenly_spread
 from heatsplat.effects.observations import MAX_IN_FRONT, Observations
 from heatsplat.geometry.surfaces import on_the_side_of, plane_axes
+from heatsplat.physics.noise import MAD_TO_SIGMA
 
 NEIGHBOURS, WIDER = 8, 16  # of a point: of its first plane, and of the one that leaves out those of other surfaces
 MIN_POINTS = 12  # points below which no surface can be told
 ROUNDS = 3  # of weighing neighbours by how far they are from the plane
 OFF = 2.0  # usual distances from it at which a neighbour counts a quarter (Cauchy's weights, squared)
-OF_MEDIAN = 1.4826  # standard deviation of normal errors of a median size
 
 
 def normals(obs: Observations) -> Tensor | None:
@@ -40,7 +40,7 @@ def _planes(points: Tensor, at: Tensor) -> Tensor:
     around = points[torch.from_numpy(near)] - at[:, None]
     for _ in range(ROUNDS):
         off = ((around - middle[:, None]) * found[:, None]).sum(2)
-        usual = OF_MEDIAN * off[:, : NEIGHBOURS + 1].abs().median(1, keepdim=True).values
+        usual = MAD_TO_SIGMA * off[:, : NEIGHBOURS + 1].abs().median(1, keepdim=True).values
         weights = (1.0 + (off / (OFF * usual).clamp_min(1e-12)) ** 2) ** -2
         middle = (weights[..., None] * around).sum(1) / weights.sum(1, keepdim=True)
         rest = weights.sqrt()[..., None] * (around - middle[:, None])

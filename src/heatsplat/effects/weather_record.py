@@ -72,16 +72,22 @@ def _span(values: Tensor) -> float:
     return float((high - low)[(high > low)].quantile(0.9)) if bool((high > low).any()) else 0.0
 
 
+def samples_around(samples_s: Tensor, times_s: Tensor) -> tuple[Tensor, Tensor]:
+    """For times [F] the sample [F] after each, never the first, and the share [F] of the way to it from the one before."""
+    after = torch.searchsorted(samples_s, times_s).clamp(1, len(samples_s) - 1)
+    share = (times_s - samples_s[after - 1]) / (samples_s[after] - samples_s[after - 1])
+    return after, share.clamp(0, 1)
+
+
 def at(weather: Weather, series: Tensor, times_s: Tensor) -> Tensor:
     """A series [T, ...] of the record at times [F] within it, linear between samples; its ends beyond."""
     return _between(weather.times_s, series, times_s)
 
 
 def _between(samples_s: Tensor, series: Tensor, times_s: Tensor) -> Tensor:
-    above = torch.searchsorted(samples_s, times_s).clamp(1, len(samples_s) - 1)
-    before, after = samples_s[above - 1], samples_s[above]
-    share = ((times_s - before) / (after - before)).clamp(0, 1).reshape(-1, *[1] * (series.ndim - 1))
-    return series[above - 1] * (1 - share) + series[above] * share
+    after, share = samples_around(samples_s, times_s)
+    share = share.reshape(-1, *[1] * (series.ndim - 1))
+    return series[after - 1] * (1 - share) + series[after] * share
 
 
 def remembered(times_s: Tensor, per_s: Tensor, frames_s: Tensor) -> slice:

@@ -136,7 +136,7 @@ def weighed(
         least_db, nothing_db: decibels that are a gain, and that are none.
         sigmas: standard errors from which a gain is no chance.
     """
-    if gain.sigmas > sigmas and gain.db > least_db and large:
+    if gain.exceeds(least_db, sigmas) and large:
         return Evidence(gain.sigmas, found, gain_db=gain.db)
     if (gain.sigmas < CHANCE or gain.db < nothing_db) and can_be_none:
         return Evidence(min(gain.sigmas, CHANCE), found, gain_db=gain.db)
@@ -174,8 +174,7 @@ class Weathered:
     @property
     def nodes(self) -> int:
         """Temperatures that a body has: 2, surface and core, where that explains observations better that were left out."""
-        gain = self.gain(DEPTH)
-        return 2 if gain.sigmas > SIGMAS and gain.db > MIN_DB else 1
+        return 2 if self.gain(DEPTH).exceeds(MIN_DB, SIGMAS) else 1
 
     @cached_property
     def clouded(self) -> bool:
@@ -183,7 +182,7 @@ class Weathered:
         if self.weather.clouds is None or "radiation" not in self.parts:
             return False
         gain = compared(self.squares((*self.parts, CLOUDS)), self._whole, self.weights)
-        return gain.sigmas > SIGMAS and gain.db > MIN_DB
+        return gain.exceeds(MIN_DB, SIGMAS)
 
     @cached_property
     def rained(self) -> bool:
@@ -191,7 +190,7 @@ class Weathered:
         if self._wet is None:
             return False
         gain = compared(self.squares((*self.parts, RAIN), True), self.squares(self.parts, True), self.weights)
-        return gain.sigmas > PART_SIGMAS and gain.db > MIN_DB
+        return gain.exceeds(MIN_DB, PART_SIGMAS)
 
     @cached_property
     def _wet(self) -> Tensor | None:
@@ -526,14 +525,13 @@ class Weathered:
         over = rate * (1.0 - keep) / given
         rest = torch.cat([drivers[0, :1], drivers[0, 1:] / exchange[0], torch.ones(1, dtype=torch.float64)])
         state = rest.expand(len(rate), -1)
-        above = torch.searchsorted(times, self.times_s).clamp(1, len(times) - 1)
-        share = ((self.times_s - times[above - 1]) / (times[above] - times[above - 1])).clamp(0, 1)[:, None]
+        above, share = weather_record.samples_around(times, self.times_s)
         found = state.new_zeros(len(rate), len(self.times_s), len(rest))
         for i in range(len(times) - 1):
             after = keep[:, i, None] * state + over[:, i, None] * driven[i]
             here = (above == i + 1).nonzero()[:, 0]
             if len(here):
-                found[:, here] = torch.lerp(state[:, None], after[:, None], share[here])
+                found[:, here] = torch.lerp(state[:, None], after[:, None], share[here, None])
             state = after
         return found[..., :-1], found[..., -1]
 

@@ -342,8 +342,7 @@ class _Visible:
     def colours(self) -> tuple[Tensor | None, Tensor | None]:
         """Colours [N, 3] of the visible image and their opacities [N], where the model has them."""
         thermal, start = self.module.thermal, 0
-        modalities = zip((thermal.modality, *thermal.companions), thermal.modality_channels, strict=True)
-        for place, (name, count) in enumerate(modalities):
+        for place, (name, count) in enumerate(thermal.images):
             if count == 3 and (name == "rgb" or place == 0):
                 opacities = self.opacities[0 if thermal.shared_opacity else place]
                 return self.look[:, start : start + 3].clamp(0, 1).float().cpu(), opacities.float().cpu()

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from heatsplat.geometry.projection import eyes
+
 
 class Similarity(NamedTuple):
     """x -> scale * rotation @ x + shift."""
@@ -61,7 +63,7 @@ def pose_errors(found: Tensor, true: Tensor) -> PoseErrors:
     **Convention:** scale and shift come from the centres, as does the rotation unless the centres lie on a line, where the
     orientations give it.
     """
-    centres, true_centres = (-(m[:, :3, :3].mT @ m[:, :3, 3:])[..., 0] for m in (found, true))
+    centres, true_centres = eyes(found), eyes(true)
     size = (true_centres - true_centres.mean(0)).norm(dim=1).max()
     fitted = similarity_between(centres, true_centres)
     flatness = torch.linalg.svdvals(true_centres - true_centres.mean(0))

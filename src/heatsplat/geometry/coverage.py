@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from heatsplat.contracts import Camera
-from heatsplat.geometry.projection import to_camera, to_pixels, to_world
+from heatsplat.geometry.projection import eyes, to_camera, to_pixels, to_world
 from heatsplat.geometry.sight_lines import rays
 
 OPEN = 0.5  # a pixel with less opacity than this shows no surface, but what is far behind everything
@@ -151,8 +151,7 @@ def _by_likeness(camera: Camera, others: Sequence[Camera]) -> tuple[list[int], f
     if not others:
         return [], 0.0
     matrices = torch.stack([other.viewmat for other in others])
-    centers = -(matrices[:, :3, :3].mT @ matrices[:, :3, 3:]).squeeze(2)
-    apart = (centers - camera.center).norm(dim=1)
+    apart = (eyes(matrices) - camera.center).norm(dim=1)
     turned = 1.0 - matrices[:, 2, :3] @ camera.viewmat[2, :3]
     return (turned + apart / (1.0 + camera.center.norm())).argsort(stable=True).tolist(), float(apart.max())
 

@@ -43,6 +43,11 @@ def to_world(points: Tensor, viewmat: Tensor) -> Tensor:
     return (points - viewmat[:3, 3]) @ viewmat[:3, :3]
 
 
+def eyes(viewmats: Tensor) -> Tensor:
+    """Positions [n, 3] of cameras in the world, of their world-to-camera matrices [n, 4, 4]."""
+    return -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
+
+
 def view_matrix(rotation: Tensor, eye: Tensor) -> Tensor:
     """World-to-camera matrix [4, 4] of a camera at ``eye`` [3] whose axes are the rows of ``rotation`` [3, 3]."""
     viewmat = torch.eye(4, dtype=rotation.dtype, device=rotation.device)

@@ -6,7 +6,6 @@ They hold no seconds, so they travel between machines. docs/budget.md tells the 
 from __future__ import annotations
 
 import csv
-import io
 import math
 import statistics
 from collections import Counter
@@ -17,7 +16,7 @@ from typing import NamedTuple
 
 from heatsplat.contracts import SceneError
 from heatsplat.io.command_lines import as_dict
-from heatsplat.io.files import write_atomically
+from heatsplat.io.tables import write_csv
 
 CURVES_FILE = Path(__file__).with_name("budget_curves.csv")
 
@@ -160,19 +159,16 @@ def _which(point: Point) -> tuple[str, ...]:
 
 def write_points(points: Iterable[Point], path: Path) -> None:
     """Writes a curves file, in one order whatever that of ``points``."""
-    text = io.StringIO(newline="")
     points = sorted(points, key=lambda point: (point.method, point.scene, point.choice, point.steps))
     keys = sorted({key for point in points for key in as_dict(point.settings)})
-    writer = csv.DictWriter(text, [*COLUMNS, *keys], lineterminator="\n")
-    writer.writeheader()
-    for point in points:
-        writer.writerow(
-            {name: getattr(point, name) for name in COLUMNS}
-            | {"psnr": f"{point.psnr:.3f}"}
-            | {n: f"{getattr(point, n):.3g}" for n in ("growth", "mean_growth", "decay", "cost")}
-            | as_dict(point.settings)
-        )
-    write_atomically(path, text.getvalue())
+    rows = (
+        {name: getattr(point, name) for name in COLUMNS}
+        | {"psnr": f"{point.psnr:.3f}"}
+        | {name: f"{getattr(point, name):.3g}" for name in ("growth", "mean_growth", "decay", "cost")}
+        | as_dict(point.settings)
+        for point in points
+    )
+    write_csv(path, rows, [*COLUMNS, *keys])
 
 
 def curves_of(points: Iterable[Point]) -> dict[tuple[str, str], dict[Choice, Curve]]:

@@ -292,6 +292,11 @@ class ThermalModel(Heat):
     averaged: float = 0.1
 
     @property
+    def images(self) -> tuple[tuple[str, int], ...]:
+        """Name and channels of each image that it explains, its own first."""
+        return tuple(zip((self.modality, *self.companions), self.modality_channels, strict=True))
+
+    @property
     def opacity_channels(self) -> tuple[int, ...]:
         """Channels that each set of opacities composites: those of the renderer's modalities."""
         return (sum(self.modality_channels),) if self.shared_opacity else self.modality_channels

@@ -54,7 +54,7 @@ class Wrapper(ThermalModel):
         self.stays_here = next(filter(None, (model.stays_here for model in models)), "")
         self.shared_opacity = models[0].shared_opacity
         self.start_opacity, self.averaged = models[0].start_opacity, models[0].averaged
-        explained = [(name, count) for model in models for name, count in _images_of(model)]
+        explained = [(name, count) for model in models for name, count in model.images]
         if own_channels:
             explained.insert(0, ("thermal", own_channels))
         (self.modality, *companions), self.modality_channels = zip(*explained, strict=True)
@@ -198,11 +198,6 @@ class Wrapper(ThermalModel):
         if twice := sorted(name for name, count in times.items() if count > 1 and name not in shared):
             raise ValueError(f"two members of {type(self).__name__} call {what} {', '.join(twice)}: {remedy}")
         return _merged(parts)
-
-
-def _images_of(model: ThermalModel) -> Iterator[tuple[str, int]]:
-    """Name and channels of the images that a model explains."""
-    return zip((model.modality, *model.companions), model.modality_channels, strict=True)
 
 
 def _merged(parts: Iterable[dict[str, Any]]) -> dict[str, Any]:

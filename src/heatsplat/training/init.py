@@ -315,8 +315,7 @@ def with_heat(
     Image ``values`` [N, C] of the Gaussians are, unless they are given, those that the training views see.
     """
     means = geometry["means"]
-    modalities = zip((thermal.modality, *thermal.companions), thermal.modality_channels, strict=True)
-    looks = torch.cat([looks_at(scene, means, name, channels) for name, channels in modalities], dim=2)
+    looks = torch.cat([looks_at(scene, means, name, channels) for name, channels in thermal.images], dim=2)
     generator, log_scales = generator_for(seed, 0, "thermal"), geometry["log_scales"]
     seen = usual_values(scene, looks) if values is None else values
     seeds = Seeds(means, seen, generator, looks, _times(scene), log_scales)

@@ -161,8 +161,7 @@ class SplatTraining(SceneModel):
         self.density.initial_count = len(self.splats)
         self.density.opacities_until = self.stages.held_from("opacity_logits")
         self.density.prepare(scene, self.modality)
-        learned = (self.modality, *self.thermal.companions)
-        self.resolution.prepare(scene, learned, self.composite, self.supersample)
+        self.resolution.prepare(scene, [name for name, _ in self.thermal.images], self.composite, self.supersample)
         self._density_state = self.density.initial_state(len(self.splats), torch.device("cpu"))
         for name, statistic in self._density_state.items():
             if statistic.shape[:1] != (len(self.splats),):
@@ -170,8 +169,7 @@ class SplatTraining(SceneModel):
                     f"'{name}' of {type(self.density).__name__}.initial_state is {list(statistic.shape)}; it needs a row for "
                     f"each of the {len(self.splats)} Gaussians"
                 )
-        modalities = zip(learned, self.thermal.modality_channels, strict=True)
-        behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in modalities]
+        behind = [torch.full((count,), self.renderer.background_of(scene, name)) for name, count in self.thermal.images]
         self.register_buffer("background", self.composite.encode(torch.cat(behind), self.thermal.modality_channels[0]))
         if self._wide:  # float32 is how everything is made, and some of that is float64 on purpose
             self.double()

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Frame, SceneData, SceneError
+from heatsplat.geometry.projection import eyes
 
 # Below these nothing moved: the last digits of a file, or the pixel counts of a smaller image.
 TURNED = 1e-4  # rad
@@ -75,10 +76,10 @@ def camera_movement(before: Mapping[str, Any], frames: Iterable[Frame]) -> str |
         return None
     in_both = [rows[name] for name in now]
     old, new = before["viewmats"][in_both], torch.stack([frame.camera.viewmat for frame in now.values()])
-    distances = (_centers(old) - _centers(new)).norm(dim=1)
+    distances = (eyes(old) - eyes(new)).norm(dim=1)
     turns = old[:, :3, :3] - new[:, :3, :3]  # its norm is 2 sqrt(2) sin(angle / 2)
     angles = 2 * (turns.norm(dim=(1, 2)) / math.sqrt(8)).clamp(max=1).asin()
-    all_centers = _centers(before["viewmats"])
+    all_centers = eyes(before["viewmats"])
     spread = (all_centers - all_centers.mean(0)).norm(dim=1).median().clamp_min(1e-9)
     elsewhere = (distances > MOVED * spread) | (angles > TURNED)
     if bool(elsewhere.any()):
@@ -132,10 +133,6 @@ def _lens(frame: Frame) -> Tensor:
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     lens = [fx / camera.width, fy / camera.height, cx / camera.width, cy / camera.height]
     return torch.tensor(lens, dtype=torch.float64)
-
-
-def _centers(viewmats: Tensor) -> Tensor:
-    return -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
 
 
 def _times(frames: Sequence[Frame]) -> Tensor:

@@ -215,8 +215,7 @@ class Certainty:
 
     def _is_clear(self, more: Model, less: Model) -> bool:
         """Whether one model explains what was left out clearly better than another."""
-        gain = self.compared(more, less)
-        return gain.db > MIN_DB and gain.sigmas > MIN_SIGMAS
+        return self.compared(more, less).exceeds(MIN_DB, MIN_SIGMAS)
 
     def _shows(self, more: Model, less: Model) -> bool:
         return shows(self.compared(more, less))

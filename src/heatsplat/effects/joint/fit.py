@@ -18,6 +18,7 @@ from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import Own, Path, Shared
+from heatsplat.physics.noise import MAD_TO_SIGMA
 
 OUTLIER = 5.0  # an observation this many times the usual residual away counts nothing (Tukey's weights)
 DISTRUSTED = 0.15  # share of the points, those that are fitted worst, that is left out: edges and hidden points
@@ -260,8 +261,8 @@ class Fit:
         point by its own residuals (those at edges and those that others hide are explained by nothing)."""
         tracks = self.data.tracks
         off = self.residuals(model, known).abs() / self.errors
-        usual = max(1.4826 * float(off[self.weights > 0].median()), math.sqrt(FLOOR))
-        own = (1.4826 * _median(off, tracks.weights > 0)).clamp_min(usual)
+        usual = max(MAD_TO_SIGMA * float(off[self.weights > 0].median()), math.sqrt(FLOOR))
+        own = (MAD_TO_SIGMA * _median(off, tracks.weights > 0)).clamp_min(usual)
         robust = (1.0 - (off / (OUTLIER * own[:, None])) ** 2).clamp_min(0.0) ** 2 * tracks.weights
         free = (robust.sum(1) - self.own(model)[1].shape[2]).clamp_min(1.0)
         excess = ((robust * off**2).sum(1) + FEW * usual**2) / (free + FEW)

@@ -34,6 +34,10 @@ class HeldOut:
     sigmas: float
     images: int
 
+    def exceeds(self, db: float, sigmas: float) -> bool:
+        """Whether it is more than so many decibels, and more than so many standard errors."""
+        return self.db > db and self.sigmas > sigmas
+
 
 def fold_of(points: int, frames: int) -> Tensor:
     """In which fold an observation is left out, [P, F]."""
@@ -62,7 +66,7 @@ def compared(more: Tensor, less: Tensor, weights: Tensor) -> HeldOut:
 
 def shows(gain: HeldOut) -> bool:
     """Whether what is gained on held-out observations may be more than nothing."""
-    return gain.db > NOTHING_DB and gain.sigmas > NOTHING_SIGMAS
+    return gain.exceeds(NOTHING_DB, NOTHING_SIGMAS)
 
 
 def would_tell(gain: HeldOut, sigmas: float) -> str:

@@ -27,7 +27,7 @@ def evidence(inspected: Inspection) -> Evidence:
     if on or inspected.weathered is None:
         return found
     gain = inspected.weathered.follows
-    if gain.sigmas > SIGMAS and gain.db > MIN_DB:
+    if gain.exceeds(MIN_DB, SIGMAS):
         said = f"balances of heat gain {gain.db:.2f} dB over levels where left out, {gain.sigmas:.1f} standard errors"
         return Evidence(gain.sigmas, said, gain_db=gain.db)
     return found

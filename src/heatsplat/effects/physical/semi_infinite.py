@@ -29,9 +29,9 @@ def evidence(inspected: Inspection) -> Evidence:
         )
     gain, of_a_core = weathered.endless
     found = f"they gain {gain.db:.2f} dB over bodies of one rate where left out, {gain.sigmas:.1f} standard errors"
-    if of_a_core.sigmas > SIGMAS and of_a_core.db > MIN_DB:
+    if of_a_core.exceeds(MIN_DB, SIGMAS):
         return Evidence(0.0, f"{found}, and bodies with a core {of_a_core.db:.2f} dB over them", SOLVED)
-    if gain.sigmas > SIGMAS and gain.db > MIN_DB:
+    if gain.exceeds(MIN_DB, SIGMAS):
         if of_a_core.sigmas < -WORSE and of_a_core.db < -MIN_DB:
             return Evidence(gain.sigmas, found, SOLVED, gain_db=gain.db)
         found = f"{found}, but bodies with a core do as well ({of_a_core.db:+.2f} dB)"

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from heatsplat.geometry.resampling import resampled
-from heatsplat.io.pictures import ERROR, THERMAL, colorize, data_uri
+from heatsplat.io.pictures import ERROR, THERMAL, bounds_of, colorize, data_uri
 from heatsplat.io.tiff import read_temperature
 from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.leaderboard.plan import Board
@@ -116,7 +116,7 @@ def _pictures(scene: str, found: Standings, board: Board) -> list[dict[str, Any]
             continue
         name = names[len(names) // 2]
         exact = read_temperature(truth / f"{name}.tiff")
-        low, high = (float(value) for value in np.nanpercentile(exact, (0.1, 99.9)))
+        low, high = bounds_of(exact[~np.isnan(exact)])
         earlier = pictures_before.get((scene, name), {"renders": {}, "errors": {}})
         kept = [entry.method for entry in own if entry.earlier.numbers and entry.method in earlier["renders"]]
         others = [entry for entry in own if entry.method not in kept]
