@@ -16,6 +16,9 @@ from heatsplat.kernels import gpu
 from heatsplat.kernels.simd import LANES
 from heatsplat.physics.fused import Unwritten
 
+Stepped = tuple[dict[str, Any], torch.Tensor]  # a group and one of its parameters
+SteppedByRows = tuple[dict[str, Any], torch.Tensor, Unwritten]  # and its gradient
+
 
 class OnePassAdam(torch.optim.Adam):
     """torch's Adam, whose step is one kernel over all float32 tensors (heatsplat.kernels.adam, kernels.gpu.adam on CUDA).
@@ -52,6 +55,25 @@ class OnePassAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
+        stepped, by_rows = self._with_gradients()
+        if all(_fits_kernel(x) and x.grad.dtype == x.dtype for _, x in stepped):
+            self._step_in_kernel(stepped, by_rows)
+            return loss
+        for group, x, unwritten in by_rows:
+            x.grad = unwritten.written(x.shape)
+            stepped.append((group, x))
+        if all(_fits_kernel(x, "cuda") and x.grad.dtype == x.dtype for _, x in stepped) and gpu.available():
+            self._step_on_cuda(stepped)
+        else:
+            self._step_in_torch(stepped)
+        self._sums = None
+        return loss
+
+    step.hooked = True  # or torch wraps it in a record for its profiler, with hooks that nobody sets here
+
+    def _with_gradients(self) -> tuple[list[Stepped], list[SteppedByRows]]:
+        """The parameters whose gradient is in ``grad``, and those whose gradient is not written out at all; what was waiting for
+        either is taken from it."""
         stepped, by_rows = [], []
         for group in self.param_groups:
             for x in group["params"]:
@@ -63,31 +85,17 @@ class OnePassAdam(torch.optim.Adam):
                     x.grad += unwritten.written(x.shape)
                 if x.grad is not None:
                     stepped.append((group, x))
-        if all(_fits_kernel(x) and x.grad.dtype == x.dtype for _, x in stepped):
-            self._step_in_kernel(stepped, by_rows)
-        else:
-            for group, x, unwritten in by_rows:
-                x.grad = unwritten.written(x.shape)
-                stepped.append((group, x))
-            if all(_fits_kernel(x, "cuda") and x.grad.dtype == x.dtype for _, x in stepped) and gpu.available():
-                self._step_on_cuda(stepped)
-            else:
-                for group, x in stepped:
-                    if group.get("group_penalty"):
-                        x.grad += group["group_penalty"] * x * _reciprocals(x.square().flatten(0, -2).sum(0).sqrt())
-                    if group["fused"] and self.state[x]:  # torch counts on the device there, and ours on the CPU
-                        self.state[x]["step"] = self.state[x]["step"].to(x.device)
-                super().step()
-            self._sums = None
-        return loss
+        return stepped, by_rows
 
-    step.hooked = True  # or torch wraps it in a record for its profiler, with hooks that nobody sets here
+    def _step_in_torch(self, stepped: list[Stepped]) -> None:
+        for group, x in stepped:
+            if group.get("group_penalty"):
+                x.grad += group["group_penalty"] * x * _reciprocals(x.square().flatten(0, -2).sum(0).sqrt())
+            if group["fused"] and self.state[x]:  # torch counts on the device there, and ours on the CPU
+                self.state[x]["step"] = self.state[x]["step"].to(x.device)
+        super().step()
 
-    def _step_in_kernel(
-        self,
-        stepped: list[tuple[dict[str, Any], torch.Tensor]],
-        by_rows: list[tuple[dict[str, Any], torch.Tensor, Unwritten]],
-    ) -> None:
+    def _step_in_kernel(self, stepped: list[Stepped], by_rows: list[SteppedByRows]) -> None:
         tensors, rates, kept, tasks = [], [], [], 0
         decays = [np.array([group["weight_decay"] for group, _ in stepped], np.float32).repeat(LANES)]
         decayed = decays[0].size
@@ -118,7 +126,7 @@ class OnePassAdam(torch.optim.Adam):
             self._squares = parameter, parameter._version, squares
             self._sums = np.concatenate([self._sums, sums])
 
-    def _step_on_cuda(self, stepped: list[tuple[dict[str, Any], torch.Tensor]]) -> None:
+    def _step_on_cuda(self, stepped: list[Stepped]) -> None:
         from heatsplat.kernels.gpu import adam as on_cuda  # here, for Triton is not everywhere
 
         rows, counts, kept, programs = [], [], [], 0

@@ -280,55 +280,53 @@ class SplatTraining(SceneModel):
 
     def training_step(self, view: View, batch_idx: int) -> dict[str, Any]:
         step = self.global_step
-        here, progress = self.schedule.round_step(step), self.schedule.progress(step)
+        round_step, progress = self.schedule.round_step(step), self.schedule.progress(step)
         ratio = self.resolution.ratio(progress)
         view = self.resolution.chosen(view, step, self.seed)
         camera = rendered(view.camera, self.supersample / ratio)
         view = self.resolution.reduced(view.to(self.device, self.dtype), ratio)
         frame = view.frame if camera is view.camera else replace(view.frame, camera=camera)
-        self.thermal.on_step(here)
-        signs = self.overlap.signs_at(here, len(self.splats) * self.thermal.per_row, self.seed)
-        maps = self.density.maps_at(here)
-        drawn = generator_for(self.seed, step, "rays") if self.thermal.rows == NOTHING else None
+        self.thermal.on_step(round_step)
         self.cameras.keep_apart()
-        taken_from = self.cameras.of(frame, progress)
+        signs = self.overlap.signs_at(round_step, len(self.splats) * self.thermal.per_row, self.seed)
         output = self.render(
             frame,
-            self.sensor.needs_depth,
-            self.density.absgrad_at(here),
-            maps,
-            ratio,
-            signs,
-            generator=drawn,
-            camera=taken_from,
+            depth=self.sensor.needs_depth,
+            absgrad=self.density.absgrad_at(round_step),
+            maps=self.density.maps_at(round_step),
+            ratio=ratio,
+            signs=signs,
+            generator=generator_for(self.seed, step, "rays") if self.thermal.rows == NOTHING else None,
+            camera=self.cameras.of(frame, progress),
         )
         image, *companions = self._images(output)
-        prediction = self.sensor(image, frame, output.seen_depth)
         inputs = LossInputs(
-            prediction,
-            view.image(self.modality),
-            view.mask,
-            view,
-            self.splats,
-            step,
-            progress,
-            {name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)},
-            ratio,
+            prediction=self.sensor(image, frame, output.seen_depth),
+            target=view.image(self.modality),
+            mask=view.mask,
+            view=view,
+            splats=self.splats,
+            step=step,
+            progress=progress,
+            companions={
+                name: (seen, view.image(name)) for name, seen in zip(self.thermal.companions, companions, strict=True)
+            },
+            ratio=ratio,
         )
-        entropy = {} if signs is None else {"entropy": self.overlap.entropy(output)}
-        regularisers = (
+        terms = summands(
+            self.loss(inputs),
             self.thermal.regularisers(self.splats),
             self.sensor.regularisers(),
             self.cameras.regularisers(),
+            {} if signs is None else {"entropy": self.overlap.entropy(output)},
         )
-        terms = summands(self.loss(inputs), *regularisers, entropy)
-        self._rendered, self._pixels = (output, camera), inputs.target[..., 0].numel()
         loss = reduce(operator.add, terms.values())
         if output.weighted is not None:  # adds 0 to the loss; sums count pixels of full size
-            maps = self.density.pixel_maps(pixel_errors(inputs, camera), known_target(inputs, camera), here)
+            maps = self.density.pixel_maps(pixel_errors(inputs, camera), known_target(inputs, camera), round_step)
             loss = loss + (output.weighted.image * maps).sum() * ratio**2
+        self._rendered, self._pixels = (output, camera), inputs.target[..., 0].numel()
         told = {name: term.detach() for name, term in terms.items()}
-        return {"loss": loss, "terms": told, "prediction": prediction.detach()}
+        return {"loss": loss, "terms": told, "prediction": inputs.prediction.detach()}
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
@@ -348,8 +346,8 @@ class SplatTraining(SceneModel):
 
     def optimizer_step(self, epoch, batch_idx, optimizer, optimizer_closure=None) -> None:
         """The optimiser's step, then density control: before any callback can write a checkpoint of this step."""
-        step = self.global_step
-        inner = plain(optimizer)
+        step, inner = self.global_step, plain(optimizer)
+        round_step = self.schedule.round_step(step)
         if step in self.schedule.restarts:
             inner.state.clear()
             for statistic in self._density_state.values():
@@ -361,15 +359,21 @@ class SplatTraining(SceneModel):
         if not self._checked_trained:
             self._checked_trained = True
             check_trained(self, inner)
-        cloud = self.cloud(inner)
-        here = self.schedule.round_step(step)
         if self.optim.decoupled is not None and update:
-            self.optim.decoupled(inner, self.schedule.planned(here), self._pixels, self.scene.extent)
-        shrunk = self.overlap.shrink(cloud, here)
-        for name, gone, instead in self.thermal.rows_to_drop(self.splats, here):
+            self.optim.decoupled(inner, self.schedule.planned(round_step), self._pixels, self.scene.extent)
+        self._change_gaussians(self.cloud(inner), step, round_step)
+        if update and self.schedule.left(step + 1) < self._averaged:
+            self._average.take(self._learned())
+
+    def _change_gaussians(self, cloud: Cloud, step: int, round_step: int) -> None:
+        """What comes after the optimiser's step: resets of sizes, density control, and what both mean for all that knows of
+        the Gaussians by their number or place."""
+        shrunk = self.overlap.shrink(cloud, round_step)
+        for name, gone, instead in self.thermal.rows_to_drop(self.splats, round_step):
             cloud.drop(name, gone, instead)
         before, centres = len(self.splats), self.splats.means
-        change = self.density.refine(cloud, here, self.scene.extent, generator_for(self.seed, step, "density"))
+        generator = generator_for(self.seed, step, "density")
+        change = self.density.refine(cloud, round_step, self.scene.extent, generator)
         self._check_change(change, len(self.splats) - before)
         self.density_change = change
         if change is not None and not len(self.splats):
@@ -383,11 +387,9 @@ class SplatTraining(SceneModel):
         if change is not None or shrunk:
             self._average.forget()
         if change is not None:
-            for group in inner.param_groups:
+            for group in cloud.optimizer.param_groups:
                 if group["name"] in self._declared:
                     group |= penalties(self._declared[group["name"]], len(self.splats))
-        if update and self.schedule.left(step + 1) < self._averaged:
-            self._average.take(self._learned())
 
     def _check_change(self, change: Any, more: int) -> None:
         """Raises ValueError where density control does not tell what it did: averages and penalties would go on as before."""
