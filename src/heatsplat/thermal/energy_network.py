@@ -338,37 +338,53 @@ class EnergyNetwork(ThermalModel):
             return {}
         stride = -(-len(seen.ids) // self.options.sampled)
         rows = torch.arange(self._step % stride, len(seen.ids), stride, device=seen.ids.device)
-        ids, base, now = seen.ids[rows], seen.base[rows], seen.units[rows]
+        ids, base = seen.ids[rows], seen.base[rows]
         terms = {}
         if "physical" in weights:
             body = self._body(splats, ids, base, seen.hidden[rows])
             terms["physical"] = heat_terms.to_reference(body, reference(splats["label"].detach()[ids].long()))
-        start_s, hidden = seen.time_s, seen.hidden[rows]
-        ends = float(self.weather.times_s[0]), float(self.weather.times_s[-1])
-        if self.options.collocation == "record" and set(weights) - {"physical"}:
-            start_s = ends[0] + (ends[1] - ends[0]) * math.fmod(self._step * PLASTIC, 1.0)
-            hidden = self.network(base, self._moment(start_s))
-            now = self._units(hidden)
-        interval = self._interval(start_s)
-        if interval == 0 or not set(weights) - {"physical"}:
-            return {name: weights[name] * term for name, term in terms.items()}
-        last_s = min(max(start_s + interval, ends[0]), ends[1])  # the sum may round to a hair outside
-        middle_s = 0.5 * (start_s + last_s)
-        last = self.network(base, self._moment(last_s))
-        later = self._units(last)
-        if "smooth" in weights:
+        if set(weights) - {"physical"}:
+            start_s, hidden, now = seen.time_s, seen.hidden[rows], seen.units[rows]
+            if self.options.collocation == "record":
+                first_s, last_s = self._ends
+                start_s = first_s + (last_s - first_s) * math.fmod(self._step * PLASTIC, 1.0)
+                hidden = self.network(base, self._moment(start_s))
+                now = self._units(hidden)
+            terms |= self._terms_over(self._interval(start_s), start_s, splats, ids, base, hidden, now)
+        return {name: weights[name] * term for name, term in terms.items()}
+
+    def _terms_over(
+        self, interval: float, start_s: float, splats: Splats, ids: Tensor, base: Tensor, hidden: Tensor, now: Tensor
+    ) -> dict[str, Tensor]:
+        """Those of "smooth", "ode" and "pinn" that are on, over so many seconds; none of an interval of 0.
+
+        Args:
+            start_s: when it begins.
+            ids: [n] Gaussians.
+            base, hidden: [n, width] the network's share of what belongs to them, and its hidden values at the start.
+            now: [n] their temperatures at the start, in units of the network.
+        """
+        terms, wanted = {}, self.options.penalties
+        if interval == 0:
+            return terms
+        first_s, last_s = self._ends
+        end_s = min(max(start_s + interval, first_s), last_s)  # the sum may round to a hair outside
+        at_end = self.network(base, self._moment(end_s))
+        later = self._units(at_end)
+        if "smooth" in wanted:
             terms["smooth"] = heat_terms.change(now, later)
         if self.options.balanced:
             areas = self.balance.areas(splats, ids, self.metres_per_unit)
             first_rate = self._rate(now, self._body(splats, ids, base, hidden), areas, start_s)
-            if "ode" in weights:
+            if "ode" in wanted:
+                middle_s = 0.5 * (start_s + end_s)
                 middle = self._body(splats, ids, base, self.network(base, self._moment(middle_s)))
                 rate = self._rate(now + interval / 2 * first_rate, middle, areas, middle_s)
                 terms["ode"] = heat_terms.integration(now, later, rate, interval)
-            if "pinn" in weights:
-                rate = 0.5 * (first_rate + self._rate(later, self._body(splats, ids, base, last), areas, last_s))
+            if "pinn" in wanted:
+                rate = 0.5 * (first_rate + self._rate(later, self._body(splats, ids, base, at_end), areas, end_s))
                 terms["pinn"] = heat_terms.difference_quotient(now, later, rate, interval, self.options.interval_s[1])
-        return {name: weights[name] * term for name, term in terms.items()}
+        return terms
 
     def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
         return self.range.kelvin(self.features(splats, Query(ids, time_s=time_s))[:, 0])
@@ -425,10 +441,13 @@ class EnergyNetwork(ThermalModel):
         """Seconds from the view to the other end of the interval: forward, or back where the record ends."""
         shortest, longest = self.options.interval_s
         wanted = shortest + (longest - shortest) * math.fmod(self._step * GOLDEN, 1.0)
-        first, last = float(self.weather.times_s[0]), float(self.weather.times_s[-1])
-        if time_s + wanted <= last:
-            return wanted
-        return max(-wanted, first - time_s)
+        first_s, last_s = self._ends
+        return wanted if time_s + wanted <= last_s else max(-wanted, first_s - time_s)
+
+    @property
+    def _ends(self) -> tuple[float, float]:
+        """First and last second of the weather record."""
+        return float(self.weather.times_s[0]), float(self.weather.times_s[-1])
 
     def _base(self, splats: Splats, ids: Tensor | None) -> Tensor:
         """What the network's first layer makes of all that belongs to the Gaussians, [n, width]."""
