@@ -11,7 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -240,6 +240,32 @@ def _pixels(camera: Camera, images: Tensor, masks: Tensor | None) -> Tracks:
     )
 
 
+class Placed(NamedTuple):
+    """Where points lie in an image.
+
+    Args:
+        pixels: [n, 2] (x, y); of points behind the camera they mean nothing.
+        depths: [n] camera z.
+        inside: [n] bool, before the camera and within the middles of the outermost pixels.
+        positions: [n, 2] the pixels in [-1, 1], as ``between`` takes them.
+    """
+
+    pixels: Tensor
+    depths: Tensor
+    inside: Tensor
+    positions: Tensor
+
+
+def placed(points: Tensor, camera: Camera) -> Placed:
+    """Where points [n, 3] lie in the image of a camera."""
+    local = to_camera(points, camera.viewmat)
+    ahead = local[:, 2] > 1e-9
+    pixels = to_pixels(torch.where(ahead[:, None], local, local.new_ones(3)), camera.K)
+    extent = pixels.new_tensor([camera.width, camera.height])
+    inside = ahead & (pixels >= 0.5).all(1) & (pixels <= extent - 0.5).all(1)
+    return Placed(pixels, local[:, 2], inside, 2.0 * pixels / extent - 1.0)
+
+
 def tracks_of(
     points: Tensor, cameras: Sequence[Camera], images: Tensor, masks: Tensor | None, noise: float
 ) -> Tracks | None:
@@ -250,18 +276,12 @@ def tracks_of(
     cell = max(2.0, math.sqrt(2.0 * width * height / len(points)))
     columns: dict[str, list[Tensor]] = {name: [] for name in Tracks.__dataclass_fields__ if name != "points"}
     for f, camera in enumerate(cameras):
-        image = images[f].double()
-        local = to_camera(points, camera.viewmat)
-        ahead = local[:, 2] > 1e-9
-        pixels = to_pixels(torch.where(ahead[:, None], local, local.new_ones(3)), camera.K)
-        extent = pixels.new_tensor([width, height])
-        inside = ahead & (pixels >= 0.5).all(1) & (pixels <= extent - 0.5).all(1)
-        inside = inside & ~_hidden(pixels, local[:, 2], inside, cell, width)
-        pixels, inside, centre = pixels[followed], inside[followed], camera.center
+        image, seen = images[f].double(), placed(points, camera)
+        inside = seen.inside & ~_hidden(seen.pixels, seen.depths, seen.inside, cell, width)
+        pixels, inside, position = seen.pixels[followed], inside[followed], seen.positions[followed]
         line, column = pixels[:, 1].clamp(0, height - 1).long(), pixels[:, 0].clamp(0, width - 1).long()
-        towards = centre - points[followed]
+        towards = camera.center - points[followed]
         distance = towards.norm(dim=1)
-        position = 2.0 * pixels / extent - 1.0
         if masks is not None:
             inside = inside & counted_between(masks[f], position)
         columns["values"].append(between(image[..., None], position)[:, 0])

@@ -92,30 +92,46 @@ def _swept(
     cameras: Sequence[Camera], images: Sequence[Tensor], k: int, others: Sequence[int], noise: float, middle: Tensor
 ) -> Tensor:
     """Points [n, 3] of one view."""
-    image, camera = images[k], cameras[k]
+    camera = cameras[k]
+    patches, places = _textured(images[k], noise)
+    if not len(patches):
+        return images[k].new_zeros(0, 3)
+    own, at = _standard(patches), _block(camera) * places
+    rays = torch.linalg.solve(camera.K, torch.cat([at, torch.ones_like(at[..., :1])], 2)[..., None])[..., 0]
+    away = float((middle - camera.center).norm())
+    depths = 1.0 / torch.linspace(1.0 / (FARTHEST * away), 1.0 / (NEAREST * away), DEPTHS, dtype=torch.float64)
+    alike = torch.stack([_alike(own, rays, depths, camera.viewmat, cameras[i], images[i]) for i in others])
+    kept, nearness = _peaks(_agreed(alike), depths)
+    middles = rays[kept, rays.shape[1] // 2]
+    return to_world(middles / nearness[:, None], camera.viewmat)
+
+
+def _textured(image: Tensor, noise: float) -> tuple[Tensor, Tensor]:
+    """Patches [n, q] of an image [H, W] that show most, and the places [n, q, 2] (x, y) of their pixels in it."""
     side = 2 * REACH + 1
-    patches = image.unfold(0, side, 1).unfold(1, side, 1).flatten(2)  # [H - 2 REACH, W - 2 REACH, side²]
+    patches = image.unfold(0, side, 1).unfold(1, side, 1).flatten(2)  # [H - 2 REACH, W - 2 REACH, q]
     texture = patches.std(2).nan_to_num(0.0).flatten()
     order = texture.argsort(descending=True)
     order = order[texture[order] > max(TEXTURE * noise, 1e-6)]
     order = order[evenly_spread(len(order), PIXELS)]
-    if not len(order):
-        return image.new_zeros(0, 3)
-    across = patches.shape[1]
-    own = _standard(patches.flatten(0, 1)[order])
+    top, left = order // patches.shape[1], order % patches.shape[1]
     offsets = torch.arange(side, dtype=torch.float64)
     down, right = torch.meshgrid(offsets, offsets, indexing="ij")
-    at = (
-        torch.stack([(order % across)[:, None] + right.flatten(), (order // across)[:, None] + down.flatten()], 2) + 0.5
-    )
-    pixels = torch.cat([_block(camera) * at, torch.ones_like(at[..., :1])], 2)
-    rays = torch.linalg.solve(camera.K, pixels[..., None])[..., 0]
-    away = float((middle - camera.center).norm())
-    depths = 1.0 / torch.linspace(1.0 / (FARTHEST * away), 1.0 / (NEAREST * away), DEPTHS, dtype=torch.float64)
-    scores = torch.stack([_alike(own, rays, depths, camera.viewmat, cameras[i], images[i]) for i in others])
-    seen = scores.isfinite()
-    half = scores.nan_to_num(-1.0).sort(dim=0, descending=True).values[: len(others) // 2 + 1]  # others may be hidden
-    score = torch.where(seen.sum(0) > len(others) // 2, half.mean(0), -1.0)  # [n, D]
+    places = torch.stack([left[:, None] + right.flatten(), top[:, None] + down.flatten()], 2) + 0.5
+    return patches.flatten(0, 1)[order], places
+
+
+def _agreed(alike: Tensor) -> Tensor:
+    """How much other views agree on each depth [n, D], from what each of them says [V, n, D] (nan where it does not see it): the
+    mean of the better half, as the others may be hidden; -1 where fewer see it."""
+    half = len(alike) // 2
+    better = alike.nan_to_num(-1.0).sort(dim=0, descending=True).values[: half + 1]
+    return torch.where(alike.isfinite().sum(0) > half, better.mean(0), -1.0)
+
+
+def _peaks(score: Tensor, depths: Tensor) -> tuple[Tensor, Tensor]:
+    """Which pixels [n] have one depth that is clearly the best of ``depths`` [D], none at their ends, by a score [n, D]; and one
+    over the depth of these, to a part of a step."""
     best, place = score.max(1)
     far = (torch.arange(DEPTHS) - place[:, None]).abs() > 4
     rival = torch.where(far, score, -1.0).amax(1)
@@ -124,9 +140,7 @@ def _swept(
     score, place = score[kept], place[kept]
     before, peak, after = (score.gather(1, (place + step)[:, None])[:, 0] for step in (-1, 0, 1))
     shift = 0.5 * (before - after) / (before - 2.0 * peak + after).clamp_max(-1e-9)  # of a parabola's top
-    nearness = 1.0 / depths[place] + shift * (1.0 / depths[1] - 1.0 / depths[0])
-    local = rays[kept, side * side // 2] / nearness[:, None]
-    return to_world(local, camera.viewmat)
+    return kept, 1.0 / depths[place] + shift * (1.0 / depths[1] - 1.0 / depths[0])
 
 
 def _alike(own: Tensor, rays: Tensor, depths: Tensor, viewmat: Tensor, camera: Camera, image: Tensor) -> Tensor:

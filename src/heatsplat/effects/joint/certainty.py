@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -74,31 +74,48 @@ class Certainty:
     @cached_property
     def doubts(self) -> dict[str, str]:
         """Why nobody can tell whether an effect is there, by name: of those taken in, and of those that may be there instead."""
-        found = {
-            name: self.told[name] if name in self.told else self.worth(name).doubt for name in sorted(self.model.names)
-        }
-        found = {name: doubt for name, doubt in found.items() if doubt}
-        others = self.model.minus(found)  # of which each has to be clear without those that are not
-        for name in sorted(others.names - self.sure) if found else ():
-            in_time = self.fit.data.effects[name].term.in_time
-            if not in_time and not self._beside_changes(name, others, self.fit.without(others, name)):
-                found[name] = self._may_be_change(name) or ROUGH
-        for name in sorted(self.model.names - self.sure):
-            for rivals in self.fit.data.effects[name].term.rivals:
-                if not self._counts(name) or self._outdoes(name, rivals):
-                    continue
-                found[name] = f"{' and '.join(rivals)} would explain the images as well; more frames would tell"
-                for rival in set(rivals) - self.model.names:
-                    found.setdefault(rival, f"it would explain the images as well as {name}")
+        found = self._own_doubts()
+        found |= self._unclear_without(found)
+        for name, rivals in self._equals():
+            found[name] = f"{' and '.join(rivals)} would explain the images as well; more frames would tell"
+            for rival in set(rivals) - self.model.names:
+                found.setdefault(rival, f"it would explain the images as well as {name}")
         doubted = sorted(found.keys() & self.model.names)
-        names = " and ".join(doubted)
+        why = f"it goes or comes with {' and '.join(doubted)}, which nobody can tell from these images"
         for name in self._instead_of(doubted):
-            found.setdefault(name, f"it goes or comes with {names}, which nobody can tell from these images")
-        heat = {name for name in found if self.fit.data.effects[name].term.in_time}
+            found.setdefault(name, why)
+        heat = {name for name in found if self._in_time(name)}
         followed = not heat & self.model.names and not any(self._lacking(name) for name in heat)
         if heat and followed and self.fit.data.drivers is None and holds_still(self.fit, self.model, doubted):
             found = {name: doubt for name, doubt in found.items() if name not in heat}
         return {name: doubt for name, doubt in found.items() if name not in self.sure}
+
+    def _own_doubts(self) -> dict[str, str]:
+        """Why nobody can tell of an effect that was taken in, by itself."""
+        own = {
+            name: self.told[name] if name in self.told else self.worth(name).doubt for name in sorted(self.model.names)
+        }
+        return {name: doubt for name, doubt in own.items() if doubt}
+
+    def _unclear_without(self, doubts: Mapping[str, str]) -> dict[str, str]:
+        """Why nobody can tell of effects of the camera that are clear only beside those that are doubted."""
+        others, found = self.model.minus(doubts), {}
+        for name in sorted(others.names - self.sure) if doubts else ():
+            clear = self._in_time(name) or self._beside_changes(name, others, self.fit.without(others, name))
+            if not clear:
+                found[name] = self._may_be_change(name) or ROUGH
+        return found
+
+    def _equals(self) -> Iterator[tuple[str, tuple[str, ...]]]:
+        """Effects that were taken in and count, each with rivals in whose place it is not clearly better."""
+        for name in sorted(self.model.names - self.sure):
+            for rivals in self.fit.data.effects[name].term.rivals:
+                if self._counts(name) and not self._outdoes(name, rivals):
+                    yield name, rivals
+
+    def _in_time(self, name: str) -> bool:
+        """Whether an effect is one by which the scene changes."""
+        return self.fit.data.effects[name].term.in_time
 
     def idle(self, name: str, more: Model, less: Model) -> bool:
         """Whether nothing is lost without an effect: it gains nothing on held-out observations, nor does any course over time in
@@ -285,29 +302,45 @@ class Certainty:
     def _instead_of(self, doubts: Collection[str]) -> set[str]:
         """Effects that come or go when those that are doubted go, and explain about as much: heat and cameras change images
         alike."""
-        effects, less = self.fit.data.effects, self.model
+        if not doubts:
+            return set()
+        less = self.model
         for name in doubts:
             less = self.fit.without(less, name)
-        found = set()
         counts = any(self._counts(name) for name in doubts)
-        if counts:
-            start = self.fit.accepted(less)
-            _, other = grown(start, less, [name for name in effects if name not in doubts])
-            found = set() if self._is_clear(self.model, other) else set(other.names ^ self.model.names)
-            for name, more in candidates(start, less):
-                asked = name not in self.model.names | found
-                if asked and start.gain(more, less) > 1.0 and worthwhile(start, more, less, name):
-                    found |= set() if self._is_clear(self.model, more) else {name}
+        found = self._in_place_of(doubts, less) if counts else set()
+        if self._heat_may_be_there(doubts, less, counts):
+            found |= {name for name in self.fit.data.effects if self._in_time(name)} - {ANY, *self.model.names}
+        return found
+
+    def _in_place_of(self, doubts: Collection[str], less: Model) -> set[str]:
+        """Effects that come or go where a model is selected anew without those that are doubted (``less``), and that explain
+        about as much."""
+        start = self.fit.accepted(less)
+        _, other = grown(start, less, [name for name in self.fit.data.effects if name not in doubts])
+        found = set() if self._is_clear(self.model, other) else set(other.names ^ self.model.names)
+        for name, more in candidates(start, less):
+            asked = name not in self.model.names | found
+            if asked and start.gain(more, less) > 1.0 and worthwhile(start, more, less, name):
+                found |= set() if self._is_clear(self.model, more) else {name}
+        return found
+
+    def _heat_may_be_there(self, doubts: Collection[str], less: Model, counts: bool) -> bool:
+        """Whether heat may be in the place of effects that are doubted.
+
+        Args:
+            less: the model without them.
+            counts: whether any of them gains so much that something would have to take its place.
+        """
         there = self._shows if counts else self._is_clear
         # What gains little, and is none of single images, gives no way to heat that shows as clearly beside it.
-        small = not counts and not any(effects[name].term.single_images for name in doubts)
+        small = not counts and not any(self.fit.data.effects[name].term.single_images for name in doubts)
         if small and any(there(one, self.model) for one in self._changing(self.model)):
-            return found
-        changing = self._changing(less) if doubts else []
-        heat = bool(doubts) and not changing or any(may_be_heat(self.fit, self.model, name) for name in doubts)
-        if heat or any(there(one, less) and not self._is_clear(self.model, one) for one in changing):
-            found |= {name for name, one in effects.items() if one.term.in_time} - {ANY, *self.model.names}
-        return found
+            return False
+        changing = self._changing(less)
+        if not changing or any(may_be_heat(self.fit, self.model, name) for name in doubts):
+            return True
+        return any(there(one, less) and not self._is_clear(self.model, one) for one in changing)
 
     def _squares_of(self, model: Model) -> Tensor:
         if model not in self._squares:

@@ -10,8 +10,7 @@ from torch import Tensor
 from heatsplat.contracts import SceneData, evenly_spread
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.observations import MAX_FRAMES, MIN_FRAMES, NEARER, between, counted_between
-from heatsplat.geometry.projection import to_camera, to_pixels
+from heatsplat.effects.observations import MAX_FRAMES, MIN_FRAMES, NEARER, between, counted_between, placed
 
 MAX_POINTS = 6000
 BESIDE_PX = 2.0  # points that fall into one square of this size are on one line of sight
@@ -74,15 +73,11 @@ def _votes(scene: SceneData) -> tuple[Tensor, Tensor] | None:
             continue
         if view.rgb is None or view.rgb.shape[:2] != view.thermal.shape[:2]:
             return None
-        local = to_camera(points, view.camera.viewmat)
-        ahead = local[:, 2] > 1e-9
-        pixels = to_pixels(torch.where(ahead[:, None], local, local.new_ones(3)), view.camera.K)
-        extent = pixels.new_tensor([view.camera.width, view.camera.height])
-        inside[:, f] = ahead & (pixels >= 0.5).all(1) & (pixels <= extent - 0.5).all(1)
-        position = (2.0 * pixels / extent - 1.0).float()
+        seen = placed(points, view.camera)
+        inside[:, f], position = seen.inside, seen.positions.float()
         if view.mask is not None:
             inside[:, f] &= counted_between(view.mask, position)
-        behind[:, f] = _nearer(pixels, local[:, 2], inside[:, f], int(extent[0] / BESIDE_PX) + 2)
+        behind[:, f] = _nearer(seen.pixels, seen.depths, inside[:, f], int(view.camera.width / BESIDE_PX) + 2)
         values[:, f] = between(view.thermal.mean(2, keepdim=True).float(), position)
         colours[:, f] = between(view.rgb.float(), position)
     hidden = behind >= 0
