@@ -75,40 +75,41 @@ def shot_frames(
     """
     check_shot(trajectory, time, view, count)
     time = None if time is None else seconds_in(scene, time)
-    first_free = first_free_id(scene)
     if trajectory in ("test", "train"):
-        taken = getattr(scene, trajectory).frames
-        moments = [frame.time_s for frame in taken] if time is None else _moments(time, len(taken))
-        return [at_time(scene, frame, moment) for frame, moment in zip(taken, moments, strict=True)]
-    if trajectory == "cameras":
+        frames = getattr(scene, trajectory).frames
+        own = [frame.time_s for frame in frames]
+    elif trajectory == "cameras":
+        frames = _numbered(scene, [(frame.name, frame.camera) for frame in cameras])
         own = [scene.middle_s if frame.time_s is None else frame.time_s for frame in cameras]
-        moments = own if time is None else _moments(time, len(cameras))
-        return [
-            at_time(scene, Frame(frame.name, first_free + i, frame.camera), moment)
-            for i, (frame, moment) in enumerate(zip(cameras, moments, strict=True))
-        ]
-    name, moments = PurePosixPath(trajectory), None
+    else:
+        name, shown, own = _filmed(scene, trajectory, view, count, cameras)
+        finer_cameras = [camera.resized(finer * camera.width, finer * camera.height) for camera in shown]
+        names = (str(name.with_stem(f"{name.stem}_{i:04d}")) for i in range(count))
+        frames = _numbered(scene, zip(names, finer_cameras, strict=True))
+    moments = own if time is None else _moments(time, len(frames))
+    return [at_time(scene, frame, moment) for frame, moment in zip(frames, moments, strict=True)]
+
+
+def _numbered(scene: SceneData, shown: Iterable[tuple[str, Camera]]) -> list[Frame]:
+    """Frames of these names and cameras, of which the scene has none."""
+    return [Frame(name, number, camera) for number, (name, camera) in enumerate(shown, first_free_id(scene))]
+
+
+def _filmed(
+    scene: SceneData, trajectory: str, view: int | str, count: int, cameras: Sequence[Frame]
+) -> tuple[PurePosixPath, list[Camera], list[float | None]]:
+    """What images of "orbit", "path" or "view" are called after, their cameras, and their times where none are asked for."""
     if trajectory == "view":
         still = viewed(scene, view)
-        shown, name = trajectories.fixed_view(still.camera, count), PurePosixPath(still.name)
-        record = [t for t in scene.train.times_s if t is not None]
-        if time is None and count > 1 and record:
-            time = [min(record), max(record)]
-        elif time is None and still.time_s is not None:
-            time = [still.time_s]
-    else:
-        shown = _moving(scene, trajectory, count, cameras)
-        own = [frame.time_s for frame in cameras] if trajectory == "path" else []
-        if time is None and own and None not in own:
-            # Equal shares of the frames between neighbours, as their places have.
-            moments = np.interp(np.linspace(0, len(own) - 1, count), range(len(own)), own).tolist()
-        time = [scene.middle_s] if time is None and scene.middle_s is not None else time
-    shown = [camera.resized(finer * camera.width, finer * camera.height) for camera in shown]
-    moments = moments or ([None] * count if time is None else _moments(time, count))
-    return [
-        at_time(scene, Frame(str(name.with_stem(f"{name.stem}_{i:04d}")), first_free + i, camera), moment)
-        for i, (camera, moment) in enumerate(zip(shown, moments, strict=True))
-    ]
+        record = [time_s for time_s in scene.train.times_s if time_s is not None]
+        times = _moments([min(record), max(record)], count) if count > 1 and record else [still.time_s] * count
+        return PurePosixPath(still.name), trajectories.fixed_view(still.camera, count), times
+    times = [scene.middle_s] * count
+    own = [frame.time_s for frame in cameras] if trajectory == "path" else []
+    if own and None not in own:
+        # Equal shares of the frames between neighbours, as their places have.
+        times = np.interp(np.linspace(0, len(own) - 1, count), range(len(own)), own).tolist()
+    return PurePosixPath(trajectory), _moving(scene, trajectory, count, cameras), times
 
 
 def check_shot(trajectory: str, time: Times | None, view: int | str, count: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -209,41 +209,46 @@ def reproduction_of(
     wanted = _wanted(config, data, printed) if data and recipes else []
     folder = Path(root).expanduser() if root else None
     found = data.find(folder, config["folders"]) if data else {}
+    here = [scene for scene in wanted if scene in found]
     runs: list[Run] = []
     waiting: list[str] = []
     for (method, setting), recipe in recipes.items():
         others = config["others"].get(f"{method} {setting}")
-        for scene in (key for key in wanted if key in found):
+        for scene in here:
+            run = Run(method, setting, scene, found[scene], (*recipe, f"data.scene='{found[scene]}'"))
             if others is None:
-                after = None
+                runs.append(run)
             elif lost := [key for key in data.scenes if key != scene and key not in found]:
                 waiting.append(
                     f"Not run: {row_name(method, setting)} on {scene}, which comes after a run on all the other scenes; "
                     f"{', '.join(lost)} is not on disk"
                 )
-                continue
             else:
                 folders = [found[key] for key in data.scenes if key != scene]
-                scenes = ",".join(f"'{name}'" for name in folders)
-                joined = (*recipe, *others, f"data.scenes=[{scenes}]")
-                after = OnOthers(method, setting, scene, "+".join(folders), joined)
-            runs.append(Run(method, setting, scene, found[scene], (*recipe, f"data.scene='{found[scene]}'"), after))
+                runs.append(replace(run, after=_on_others(run, folders, (*recipe, *others))))
     return Reproduction(
-        paper,
-        table,
-        data,
-        folder,
-        tuple(printed),
-        tuple(rows),
-        tuple(runs),
-        absent,
-        tuple(scene for scene in wanted if scene not in found),
-        tuple(waiting),
-        dict(config["metrics"]),
-        config["unnamed"],
-        (*config["notes"], *doubts(paper, table)),
-        config["folders"] or {},
+        paper=paper,
+        table=table,
+        source=data,
+        root=folder,
+        figures=tuple(printed),
+        rows=tuple(rows),
+        runs=tuple(runs),
+        absent=absent,
+        missing=tuple(scene for scene in wanted if scene not in found),
+        waiting=tuple(waiting),
+        metrics=dict(config["metrics"]),
+        unnamed=config["unnamed"],
+        notes=(*config["notes"], *doubts(paper, table)),
+        folders=config["folders"] or {},
     )
+
+
+def _on_others(run: Run, folders: Sequence[str], overrides: tuple[str, ...]) -> OnOthers:
+    """The run on all other scenes, of these folders, after which a run comes."""
+    scenes = ",".join(f"'{name}'" for name in folders)
+    joined = (*overrides, f"data.scenes=[{scenes}]")
+    return OnOthers(run.method, run.setting, run.scene, "+".join(folders), joined)
 
 
 def _rows(
