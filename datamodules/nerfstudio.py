@@ -162,19 +162,8 @@ class Nerfstudio(SceneDataModule):
             for transforms, subset in listed.items()
             for frame in transforms.frames
         ]
-        notes: dict[str, Any] = {"registered": len(entries)}
-        photos = False
-        unnamed = [entry.visible for entry in entries if entry.visible]
-        if unnamed and not any(entry.thermal or "thermal_file_path" in entry.frame for entry in entries):
-            pixels, _ = split_alpha(read_image(folder / unnamed[0]))
-            photos = colour_levels(pixels) > PSEUDO_COLOUR_LEVELS and bounds is None and self.thermal_channels == 1
-            what = "photos (they are in colour)" if photos else "thermal images"
-            notes["images_assumed"] = (
-                f"images such as {unnamed[0]} are taken as {what}: no key, folder or bounds file says what they are. Name "
-                "thermal ones thermal_file_path, or set data.thermal_channels=3 for pseudo-colour"
-            )
-            if not photos:
-                entries = [replace(entry, thermal=entry.visible, visible=None) for entry in entries]
+        entries, photos, assumed = self._told_apart(folder, entries, bounds)
+        notes: dict[str, Any] = {"registered": len(entries), **assumed}
         _check_thermal(entries)
         subsets = _listed_subsets([*listed], entries)
         mains = [entry.visible if photos else entry.thermal for entry in entries]
@@ -211,6 +200,25 @@ class Nerfstudio(SceneDataModule):
             notes["rgb"] = f"{sum(f.read_rgb is not None for f in frames)} of {len(frames)} images have a visible one"
         times, notes["time_source"] = self._times(folder, written, [*listed][0])
         return [replace(f, time_s=times[f.name]) for f in frames] if times else frames, notes
+
+    def _told_apart(
+        self, folder: Path, entries: list[Entry], bounds: ThermalRange | None
+    ) -> tuple[list[Entry], bool, dict[str, str]]:
+        """The entries, whether they are of an RGB scene, and a note of what was assumed where nothing says which images are
+        thermal: grey ones are, and all where the scene has temperature bounds."""
+        unnamed = [entry.visible for entry in entries if entry.visible]
+        if not unnamed or any(entry.thermal or "thermal_file_path" in entry.frame for entry in entries):
+            return entries, False, {}
+        pixels, _ = split_alpha(read_image(folder / unnamed[0]))
+        photos = colour_levels(pixels) > PSEUDO_COLOUR_LEVELS and bounds is None and self.thermal_channels == 1
+        what = "photos (they are in colour)" if photos else "thermal images"
+        said = (
+            f"images such as {unnamed[0]} are taken as {what}: no key, folder or bounds file says what they are. Name "
+            "thermal ones thermal_file_path, or set data.thermal_channels=3 for pseudo-colour"
+        )
+        if not photos:
+            entries = [replace(entry, thermal=entry.visible, visible=None) for entry in entries]
+        return entries, photos, {"images_assumed": said}
 
     def _named_mask(self, folder: Path, index: ImageIndex, entry: Entry) -> Callable[[], np.ndarray] | None:
         """Reads the mask that a frame names under mask_path. Raises SceneError where there is none of that name."""

@@ -98,26 +98,9 @@ class Synthetic(SceneDataModule):
         if scene not in PRESETS and not outdoors and self.drawn is None and number_of(scene, ROOM) is None:
             known = ", ".join((*PRESETS, *YARDS, *(f"{name}0, {name}1 and so on" for name in (ROOM, DRAWN))))
             raise SceneError(f"data.scene={scene}: there is no such synthetic preset; choose one of {known}")
-        if days is not None and (scene not in OF_ANY_LENGTH or not 2 <= days <= MOST_DAYS):
-            raise SceneError(
-                f"data.days={days}: {' and '.join(OF_ANY_LENGTH)} last 2 to {MOST_DAYS} days; leave it null elsewhere"
-            )
-        if hours is not None and scene not in OF_ANY_LENGTH:
-            raise SceneError(
-                f"data.hours={hours}: {' and '.join(OF_ANY_LENGTH)} know the hour of the day; leave it null elsewhere"
-            )
-        pair = isinstance(hours, Sequence) and len(hours) == 2 and hours[0] != hours[1] and list(hours) != [24, 0]
-        if hours is not None and not (
-            pair and all(isinstance(hour, int | float) and 0 <= hour <= 24 for hour in hours)
-        ):
-            raise SceneError(
-                f"data.hours={hours}: give the first and the last hour in UTC, 0 to 24, such as [20,4] for nights"
-            )
-        if weather is not None and scene not in YARDS:
-            why = "lies in a room without weather" if self.drawn is None else "has the weather that was drawn"
-            raise SceneError(f"data.weather={weather}: scene '{scene}' {why}; leave it null")
-        if weather is not None and weather not in SKIES:
-            raise SceneError(f"data.weather={weather}: choose one of {', '.join(SKIES)}, or null")
+        _check_times(scene, days, hours)
+        if weather is not None:
+            _check_weather(scene, weather, self.drawn is not None)
         check_option("data.size", size, SIZES, SceneError)
         if frames is not None and frames < 2:
             raise SceneError(f"data.frames={frames}: a scene needs at least 2 frames, one to train and one to test")
@@ -216,6 +199,31 @@ class Synthetic(SceneDataModule):
             return solved(known if self.hours is None else replace(known, hours=self.hours))
         preset = None if self.drawn is None else self.drawn.preset
         return OutdoorScene(preset) if isinstance(preset, OutdoorPreset) else None
+
+
+def _check_times(scene: str, days: int | None, hours: Sequence[float] | None) -> None:
+    """Raises SceneError where a scene has no such length, or no such hours at which images are taken."""
+    yards = " and ".join(OF_ANY_LENGTH)
+    if days is not None and (scene not in OF_ANY_LENGTH or not 2 <= days <= MOST_DAYS):
+        raise SceneError(f"data.days={days}: {yards} last 2 to {MOST_DAYS} days; leave it null elsewhere")
+    if hours is None:
+        return
+    if scene not in OF_ANY_LENGTH:
+        raise SceneError(f"data.hours={hours}: {yards} know the hour of the day; leave it null elsewhere")
+    pair = isinstance(hours, Sequence) and len(hours) == 2 and hours[0] != hours[1] and list(hours) != [24, 0]
+    if not pair or not all(isinstance(hour, int | float) and 0 <= hour <= 24 for hour in hours):
+        raise SceneError(
+            f"data.hours={hours}: give the first and the last hour in UTC, 0 to 24, such as [20,4] for nights"
+        )
+
+
+def _check_weather(scene: str, weather: str, drawn: bool) -> None:
+    """Raises SceneError where a scene has no weather that could be chosen, or there is no such weather."""
+    if scene not in YARDS:
+        why = "has the weather that was drawn" if drawn else "lies in a room without weather"
+        raise SceneError(f"data.weather={weather}: scene '{scene}' {why}; leave it null")
+    if weather not in SKIES:
+        raise SceneError(f"data.weather={weather}: choose one of {', '.join(SKIES)}, or null")
 
 
 def _meant(folder: Path) -> str:

@@ -113,10 +113,38 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         zone_of(reading.zone, "zone")
     if not folder.is_dir():
         raise SceneError(f"source={folder} is no folder")
+    kinds, tables = _kinds_in(folder, greys_known=reading.meaning.of_greys(folder)[0] is not None)
+    kind = next(kind for kind in KINDS if kinds.get(kind))
+    reading.meaning.check_use(kind, KINDS[kind])
+    notes: list[str] = []
+    frames = list(_frames_of(kind, kinds[kind], folder, reading, notes, tables))
+    photos = [*kinds.get("colour", []), *(kinds["grey"] if kind != "grey" and "grey" in kinds else [])]
+    frames = _paired(frames, _without_previews(frames, photos, notes))
+    if reading.table is not None:
+        frames = with_table(frames, reading.table, reading.columns, notes)
+    frames = _without_fixes_of_earlier_places([_zoned(frame, reading.zone) for frame in frames], notes)
+    _check_names(frames)
+    frames = _in_order(frames, notes)
+    if reading.every > 1:
+        taken = {frame.name for device in devices_of(frames) for frame in device.frames[:: reading.every]}
+        notes.append(f"every={reading.every} takes {len(taken)} of {counted(len(frames), 'frame')}")
+        frames = [frame for frame in frames if frame.name in taken]
+    return Recording(frames, notes)
+
+
+def _kinds_in(folder: Path, greys_known: bool) -> tuple[dict[str, list[Path]], dict[Path, tuple[int, int]]]:
+    """The images in a folder and below by their kind (``_kind``), one of ``KINDS`` beside greys; and width and height of those
+    that are text, which is slow to read, and is read here anyway.
+
+    Args:
+        greys_known: whether it is known which temperatures greys are, as which sealed pictures may then be taken.
+
+    Raises:
+        SceneError: there is no thermal image, there are several kinds, or one cannot be read.
+    """
     kinds: dict[str, list[Path]] = {}
-    greys_known = reading.meaning.of_greys(folder)[0] is not None
+    tables: dict[Path, tuple[int, int]] = {}
     found = [path for path in shown_files(folder, (*SUFFIXES, *RECORDS, TABLE)) if path.is_file()]
-    tables: dict[Path, tuple[int, int]] = {}  # width and height: text is slow to read, and is read here anyway
     for path in sorted(found, key=lambda p: by_numbers(p.relative_to(folder).as_posix())):
         if path.suffix.lower() == TABLE:
             if (pixels := read_temperature_table(path)) is None:
@@ -145,29 +173,21 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
             f"{folder} holds no thermal image: radiometric JPEG of FLIR or DJI, .fff, .seq, .csq, TIFF or PNG with counts or °C, "
             f"tables of °C (.csv), or greys{_no_tables(sorted(found))}"
         )
-    kind, thermal = there[0], kinds[there[0]]
-    reading.meaning.check_use(kind, KINDS[kind])
-    notes: list[str] = []
-    frames = list(_frames_of(kind, thermal, folder, reading, notes, tables))
-    photos = [*kinds.get("colour", []), *(kinds["grey"] if kind != "grey" and "grey" in kinds else [])]
-    frames = _paired(frames, _without_previews(frames, photos, notes))
-    if reading.table is not None:
-        frames = with_table(frames, reading.table, reading.columns, notes)
-    frames = _without_fixes_of_earlier_places([_zoned(frame, reading.zone) for frame in frames], notes)
-    _check_names(frames)
-    if all(frame.time is not None for frame in frames):
-        _check_zones(frames)
-        frames.sort(key=lambda f: instant(f.time))  # those of one second stay in the order of their numbers
-    else:
+    return kinds, tables
+
+
+def _in_order(frames: list[ThermalFrame], notes: list[str]) -> list[ThermalFrame]:
+    """Frames in the order of their times; as they are where one has none, which the notes say then."""
+    timeless = sum(frame.time is None for frame in frames)
+    if timeless:
         notes.append(
-            f"{sum(f.time is None for f in frames)} of {len(frames)} frames have no time, so all are in the order of their "
-            "names (table=... adds times)"
+            f"{timeless} of {len(frames)} frames have no time, so all are in the order of their names (table=... adds times)"
         )
-    if reading.every > 1:
-        taken = {frame.name for device in devices_of(frames) for frame in device.frames[:: reading.every]}
-        notes.append(f"every={reading.every} takes {len(taken)} of {counted(len(frames), 'frame')}")
-        frames = [frame for frame in frames if frame.name in taken]
-    return Recording(frames, notes)
+        return frames
+    _check_zones(frames)
+    return sorted(
+        frames, key=lambda frame: instant(frame.time)
+    )  # those of one second stay in the order of their numbers
 
 
 def _no_tables(found: Iterable[Path]) -> str:
