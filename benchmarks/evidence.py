@@ -190,7 +190,7 @@ remains when it is off.
 """
 PICTURE = "verdicts_by_strength.png"
 STRENGTH_NOTE = f"""Do the wrong and the undecided verdicts matter? Each effect was taken out of the truth of its scene
-(`synthetic_scene/without.py`) and the scene was filmed again without noise. *Strength* is the root mean square of the difference
+(`benchmarks/without.py`) and the scene was filmed again without noise. *Strength* is the root mean square of the difference
 of training images, along the tracks of scene points and beside a level for each point, in standard deviations of the noise of a
 pixel. Only effects that are there have one. An error of poses, and what other effects could explain instead, are not in it:
 

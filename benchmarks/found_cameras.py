@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.camera_folder import Field, flight, write_camera
 from heatsplat.contracts import SceneError, check_option
 from heatsplat.datamodules.formats.colmap import SparseModel, read_model, write_model
 from heatsplat.datamodules.formats.lens import Lens
-from heatsplat.datamodules.synthetic_scene.camera_folder import Field, flight, write_camera
 from heatsplat.datamodules.synthetic_scene.film import Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene

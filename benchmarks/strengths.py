@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from benchmarks.without import scene_of, without
 from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.film import film
-from heatsplat.datamodules.synthetic_scene.without import scene_of, without
 from heatsplat.effects.observations import Tracks, between, observe
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib import colormaps
+from scene_files import APPLIED_TRANSFORM, LAYOUTS, PALETTE, clock_digits, write_rhd
 
 from heatsplat.contracts import SceneData, View
 from heatsplat.datamodules.colmap import Colmap
@@ -19,7 +20,6 @@ from heatsplat.datamodules.rhd import RHD
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, expose, film, pixel_rays
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
-from heatsplat.datamodules.synthetic_scene.writers import APPLIED_TRANSFORM, LAYOUTS, PALETTE, clock_digits, write_rhd
 from heatsplat.datamodules.thermo import Thermo
 from heatsplat.datamodules.thermoscenes import ThermoScenes
 from heatsplat.datamodules.ti_nsd import TINSD

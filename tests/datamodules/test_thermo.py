@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from layouts import names, write_colmap
+from scene_files import write_thermo
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.ntr import NTR
@@ -19,7 +20,6 @@ from heatsplat.datamodules.synthetic import Synthetic
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, film
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, OutdoorScene
 from heatsplat.datamodules.synthetic_scene.outdoor_sky import START_UTC_S
-from heatsplat.datamodules.synthetic_scene.writers import write_thermo
 from heatsplat.datamodules.thermo import Thermo
 
 FRAMES = 9

@@ -20,11 +20,13 @@ from pathlib import Path
 import cv2  # noqa: F401, I001  (before pycolmap)
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[1] / "datamodules"))
 
 from camera_files import flir_jpeg, raw_for, temperatures
 from layouts import names, points, write_colmap
 from mutate import Outcome, campaign, damaged_copy, guarded
+from scene_files import LAYOUTS
 
 from heatsplat.contracts import SceneData, SceneError
 from heatsplat.datamodules.colmap import Colmap
@@ -36,7 +38,6 @@ from heatsplat.datamodules.rhd import RHD
 from heatsplat.datamodules.synthetic_scene.film import SIZES, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
-from heatsplat.datamodules.synthetic_scene.writers import LAYOUTS
 from heatsplat.datamodules.thermo import Thermo
 from heatsplat.datamodules.thermoscenes import ThermoScenes
 from heatsplat.datamodules.ti_nsd import TINSD

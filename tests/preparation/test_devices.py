@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from recordings import read_frames, write_images
 
+from benchmarks.camera_folder import Field, dead_pixels, write_camera
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import read_model
-from heatsplat.datamodules.synthetic_scene.camera_folder import Field, dead_pixels, write_camera
 from heatsplat.datamodules.synthetic_scene.film import Recording, Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene

@@ -8,19 +8,18 @@ from datetime import timedelta
 
 import numpy as np
 import pytest
+import scene_files
 from PIL import Image
 from recordings import read_frames
 
+from benchmarks.camera_folder import Field, write_camera
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.benchmark_folder import write_scene
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.synthetic import Synthetic
-from heatsplat.datamodules.synthetic_scene import writers
-from heatsplat.datamodules.synthetic_scene.camera_folder import Field, write_camera
 from heatsplat.datamodules.synthetic_scene.film import SIZES, Recording, Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
-from heatsplat.datamodules.synthetic_scene.writers import write_colmap
 from heatsplat.doctor.base import material_of
 from heatsplat.preparation.doctor import _photo_times, check, section
 from heatsplat.preparation.frame import ThermalFrame
@@ -37,13 +36,13 @@ def still(size: Size = SIZES["tiny"]) -> Recording:
 
 
 def test_a_clean_scene_has_no_findings_and_the_file_says_so(tmp_path):
-    write_colmap(still(), tmp_path / "scene")
+    scene_files.write_colmap(still(), tmp_path / "scene")
     assert check(str(tmp_path / "scene"), tmp_path) == []
     assert json.loads((tmp_path / "doctor.json").read_text()) == []
 
 
 def test_a_working_directory_that_takes_no_files_does_not_fail_what_was_found(tmp_path, caplog, monkeypatch):
-    write_colmap(still(), tmp_path / "scene")
+    scene_files.write_colmap(still(), tmp_path / "scene")
 
     def refused(found, path):
         raise PermissionError(13, "Permission denied", str(path))
@@ -67,7 +66,7 @@ def test_a_working_directory_that_takes_no_files_does_not_fail_what_was_found(tm
     ],
 )
 def test_scenes_of_every_layout_are_read_as_their_loaders_read_them(tmp_path, caplog, layout, told):
-    getattr(writers, f"write_{layout}")(still(), tmp_path / "scene")
+    getattr(scene_files, f"write_{layout}")(still(), tmp_path / "scene")
     with caplog.at_level("INFO"):
         assert check(str(tmp_path / "scene"), tmp_path) == []
     name = "nerfstudio" if layout == "thermoscenes" else layout  # whose layout it is
@@ -75,7 +74,7 @@ def test_scenes_of_every_layout_are_read_as_their_loaders_read_them(tmp_path, ca
 
 
 def test_what_is_said_of_a_camera_s_files_is_refused_for_a_scene(tmp_path):
-    write_colmap(still(), tmp_path / "scene")
+    scene_files.write_colmap(still(), tmp_path / "scene")
     with pytest.raises(SceneError, match="bounds_c changes nothing for the scene in .*: it is for a camera's files"):
         check(str(tmp_path / "scene"), tmp_path, bounds_c=[0, 50])
     with pytest.raises(SceneError, match="counts.scale changes nothing"):
@@ -92,7 +91,7 @@ def test_dead_pixels_and_a_late_clock_are_found_in_a_camera_s_files(tmp_path):
 def test_a_look_at_files_says_what_it_could_not_look_at(tmp_path, caplog):
     recording = still(Size(64, 52, 8, 60))
     write_camera(recording, tmp_path / "camera")
-    write_colmap(recording, tmp_path / "scene")
+    scene_files.write_colmap(recording, tmp_path / "scene")
     for folder, told in (("camera", True), ("scene", False)):
         caplog.clear()
         with caplog.at_level("INFO"):
@@ -120,7 +119,7 @@ def test_greys_that_the_camera_stretched_are_found_in_its_files_before_they_are_
 def test_kelvin_in_a_scene_is_told_and_what_is_said_of_it_helps(tmp_path):
     recording = still(Size(64, 52, 8, 60))
     for name, kelvin in (("floats", 1.0), ("counts", 100.0)):
-        write_colmap(recording, tmp_path / name)
+        scene_files.write_colmap(recording, tmp_path / name)
         (tmp_path / name / "temperature_bounds.json").unlink()
         shutil.rmtree(tmp_path / name / "raw16")
         for path, celsius in zip(sorted((tmp_path / name / "images").iterdir()), recording.celsius, strict=True):

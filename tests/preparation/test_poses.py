@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.camera_folder import Field, flight, write_camera
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.colmap import read_model
 from heatsplat.datamodules.formats.colmap_library import pycolmap
-from heatsplat.datamodules.synthetic_scene.camera_folder import Field, flight, write_camera
 from heatsplat.datamodules.synthetic_scene.film import Size
 from heatsplat.geometry.alignment import pose_errors
 from heatsplat.preparation.conditions import GivenConditions

@@ -10,10 +10,10 @@ from commands import succeeds
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from recordings import read_frames, write_flir, write_images, write_sequence
 
+from benchmarks.camera_folder import Field, write_camera
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import read_model, write_model
-from heatsplat.datamodules.synthetic_scene.camera_folder import Field, write_camera
 from heatsplat.datamodules.synthetic_scene.film import Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene

@@ -5,8 +5,8 @@ import pycolmap
 import pytest
 import torch
 
+from benchmarks.camera_folder import Field, flight, write_camera
 from heatsplat.datamodules.formats.colmap import pose_matrix, read_model, write_model
-from heatsplat.datamodules.synthetic_scene.camera_folder import Field, flight, write_camera
 from heatsplat.datamodules.synthetic_scene.film import Size
 from heatsplat.geometry.alignment import Similarity, pose_errors
 from heatsplat.preparation.features import Sift

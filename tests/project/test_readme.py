@@ -56,10 +56,11 @@ def shell(arguments: list[str], cwd: Path, **environment: str) -> str:
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
     """The /data of the README: the synthetic scene written in the layouts that it names."""
+    from scene_files import LAYOUTS
+
     from heatsplat.datamodules.synthetic_scene.film import SIZES, film
     from heatsplat.datamodules.synthetic_scene.presets import PRESETS
     from heatsplat.datamodules.synthetic_scene.scene import Scene
-    from heatsplat.datamodules.synthetic_scene.writers import LAYOUTS
     from heatsplat.io.tiff import write_temperature
 
     folder = tmp_path_factory.mktemp("data")

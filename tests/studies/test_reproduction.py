@@ -403,11 +403,12 @@ def write_fake(layout: str, root: Path, *scenes: str) -> Path:
     """A data set with scenes that are the synthetic room, or the yard with its weather for Thermo."""
     from dataclasses import replace
 
+    from scene_files import LAYOUTS
+
     from heatsplat.datamodules.synthetic_scene.film import SIZES, film
     from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, OutdoorScene
     from heatsplat.datamodules.synthetic_scene.presets import PRESETS
     from heatsplat.datamodules.synthetic_scene.scene import Scene
-    from heatsplat.datamodules.synthetic_scene.writers import LAYOUTS
 
     world = OutdoorScene(OUTDOOR["outdoor"]) if layout == "thermo" else Scene(PRESETS["cooling"])
     recording = film(world, replace(SIZES["tiny"], frames=12, points=200))

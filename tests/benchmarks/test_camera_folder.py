@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.camera_folder import Field, dead_pixels, flight, sawtooth, write_camera
 from heatsplat.datamodules.formats.geodesy import east_north_up
-from heatsplat.datamodules.synthetic_scene.camera_folder import Field, dead_pixels, flight, sawtooth, write_camera
 from heatsplat.datamodules.synthetic_scene.film import Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene

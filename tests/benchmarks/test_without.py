@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from benchmarks.without import scene_of, without
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.synthetic_scene.film import Size, film
 from heatsplat.datamodules.synthetic_scene.outdoor import OUTDOOR, OutdoorScene
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
-from heatsplat.datamodules.synthetic_scene.without import scene_of, without
 
 SIZE = Size(16, 13, 5, 40)
 
