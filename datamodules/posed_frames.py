@@ -230,5 +230,5 @@ def mesh_points(folder: Path, frames: Sequence[RawFrame], count: int, seed: int)
     return points, told_random(len(points), ": no mesh.obj")
 
 
-def _some(names: Sequence[str], most: int = 5) -> str:
-    return ", ".join(names[:most]) + (" ..." if len(names) > most else "")
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")

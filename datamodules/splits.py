@@ -5,7 +5,7 @@ Positions index the frames as they were passed. ``order`` lists positions in tim
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -30,9 +30,9 @@ def every_nth(names: Sequence[str], n: int = 8) -> Positions:
     return _complement(len(names), order[::n])
 
 
-def every_frame(names: Sequence[str], n: int = 8) -> Positions:
+def every_frame(names: Sequence[str]) -> Positions:
     """All frames are training frames; those that ``every_nth`` would hold out are test frames, too."""
-    return list(range(len(names))), every_nth(names, n)[1]
+    return list(range(len(names))), every_nth(names)[1]
 
 
 def quarter_centre(order: Sequence[int]) -> Positions:
@@ -101,32 +101,7 @@ def by_list(names: Sequence[str], path: Path) -> Positions:
     Raises:
         SceneError: the file holds no such lists, or a name of no frame, or one that may be of several.
     """
-    if path.suffix.lower() == ".json":
-        lists = json_object(path)
-        if "test" not in lists:
-            raise SceneError(f'data.split_file: {path} holds no list "test"; it has {", ".join(lists) or "nothing"}')
-        for key in {"train", "test"} & set(lists):
-            if not isinstance(lists[key], list) or not all(isinstance(name, str) for name in lists[key]):
-                raise SceneError(
-                    f'data.split_file: "{key}" in {path} is {shortened(lists[key])}, a list of names is needed'
-                )
-    else:  # Excel may have put names into quotes, and separators behind them
-        lines = (line.strip().rstrip(",;\t").strip('"') for line in read_text(path).splitlines())
-        lists = {"test": [line for line in lines if line]}
-    whole = {name: [i] for i, name in enumerate(names)}
-    parts: dict[str, list[int]] = {}
-    bare: dict[str, list[int]] = {}
-    for i, name in enumerate(names):
-        path_in = PurePosixPath(name)
-        without = path_in.with_suffix("").as_posix()
-        for key in {without, path_in.name, path_in.stem}:
-            parts.setdefault(key, []).append(i)
-        for key in {name, without}:
-            bare.setdefault(key, []).append(i)
-
-    def meant_by(name: str) -> list[int]:
-        known = whole.get(name) or parts.get(name)
-        return known or next((bare[end] for end in _ends(name) if end in bare), [])
+    lists, meant_by = _lists_in(path), _meanings(names)
 
     def positions(listed: Sequence[str]) -> list[int]:
         meant = {name: meant_by(name) for name in listed}
@@ -145,6 +120,42 @@ def by_list(names: Sequence[str], path: Path) -> Positions:
 
     test = positions(lists["test"])
     return (positions(lists["train"]), test) if "train" in lists else _complement(len(names), test)
+
+
+def _lists_in(path: Path) -> Mapping[str, list[str]]:
+    """The names under "test", and "train" where the file tells those. Raises SceneError where it holds no such lists."""
+    if path.suffix.lower() != ".json":  # Excel may have put names into quotes, and separators behind them
+        lines = (line.strip().rstrip(",;\t").strip('"') for line in read_text(path).splitlines())
+        return {"test": [line for line in lines if line]}
+    lists = json_object(path)
+    if "test" not in lists:
+        raise SceneError(f'data.split_file: {path} holds no list "test"; it has {", ".join(lists) or "nothing"}')
+    for key in {"train", "test"} & set(lists):
+        if not isinstance(lists[key], list) or not all(isinstance(name, str) for name in lists[key]):
+            raise SceneError(
+                f'data.split_file: "{key}" in {path} is {shortened(lists[key])}, a list of names is needed'
+            )
+    return lists
+
+
+def _meanings(names: Sequence[str]) -> Callable[[str], list[int]]:
+    """A function that gives the positions of all names that may be meant by another."""
+    whole = {name: [i] for i, name in enumerate(names)}
+    parts: dict[str, list[int]] = {}
+    bare: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        path = PurePosixPath(name)
+        without = path.with_suffix("").as_posix()
+        for key in {without, path.name, path.stem}:
+            parts.setdefault(key, []).append(i)
+        for key in {name, without}:
+            bare.setdefault(key, []).append(i)
+
+    def meant_by(name: str) -> list[int]:
+        known = whole.get(name) or parts.get(name)
+        return known or next((bare[end] for end in _ends(name) if end in bare), [])
+
+    return meant_by
 
 
 def _ends(name: str) -> Iterator[str]:

@@ -253,7 +253,8 @@ class _Search:
     def _candidates(self) -> tuple[Tensor, dict[str, Tensor]]:
         """Pairs [n, 2] of Gaussians that agree, each in one pair, the cheapest of all; with them what each becomes."""
         splats, module = self.cloud.splats, self.module
-        shapes, pairs = Shapes.of(splats), self._neighbours()
+        shapes = Shapes.of(splats)
+        pairs = neighbour_pairs(splats.means.detach(), self.options.neighbours)
         told = torch.stack([module.emissions(splats, frame) for frame in self.sampled_frames])  # [F, N, C]
         limits = self._limits(told)
         prices = torch.cat([self._prices(part, shapes, told, limits) for part in pairs.split(PAIRS)])
@@ -282,10 +283,6 @@ class _Search:
         limits = told.new_full((told.shape[2],), other, dtype=torch.float64)
         limits[:own] = agree / self.span_k
         return limits
-
-    def _neighbours(self) -> Tensor:
-        """Pairs [n, 2] of Gaussians, first below second, one of which is among the nearest of the other."""
-        return neighbour_pairs(self.cloud.splats.means.detach(), self.options.neighbours)
 
     def _rows(self, pairs: Tensor, one: Merged, told: Tensor, limits: Tensor) -> tuple[dict[str, Tensor], Tensor]:
         """Raw tensors of what pairs become, and which of them [n] bool agree with both at all times."""

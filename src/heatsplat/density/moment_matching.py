@@ -66,9 +66,6 @@ class Merged:
     shares: Tensor
     distances: Tensor
 
-    def __getitem__(self, ids: Tensor) -> Merged:
-        return Merged(self.shapes[ids], self.axes[ids], self.variances[ids], self.shares[ids], self.distances[ids])
-
     def raw(self) -> dict[str, Tensor]:
         """The geometry as ``Splats`` stores it: means, log_scales, quats and opacity_logits."""
         flip = torch.ones_like(self.variances)

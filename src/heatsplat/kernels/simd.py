@@ -102,7 +102,7 @@ def _lane_type(*arguments: types.Type) -> LaneType | None:
     return lanes.pop()
 
 
-def _elementwise(emit, result: LaneType | None = None):
+def _elementwise(emit):
     """An intrinsic over lanes and numbers from ``emit(builder, *vectors)``, typed by the number of its arguments."""
 
     def typed(typing_context, *arguments):
@@ -117,7 +117,7 @@ def _elementwise(emit, result: LaneType | None = None):
             ]
             return emit(builder, *vectors)
 
-        return (result or lane_type)(*arguments), generate
+        return lane_type(*arguments), generate
 
     return typed
 
@@ -296,15 +296,6 @@ def total(typing_context, x):
         return builder.extract_element(vector, ir.Constant(_i32, 0))
 
     return _NUMBERS[x](x), generate
-
-
-@intrinsic
-def lane(typing_context, x, index):
-    """One lane as a number."""
-    number = _NUMBERS.get(x)
-    if number is None:
-        return None
-    return number(x, index), lambda context, builder, signature, values: builder.extract_element(*values)
 
 
 # ---- arithmetic ----
