@@ -119,24 +119,34 @@ def reconcile(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None =
     if missing:
         raise SceneError(f"there is no verdict on {', '.join(missing)}")
     found = {name: verdicts[name] for name in NAMES}
-
-    def turn(name: str, on: bool, reason: str) -> None:
-        if given.get(name) == ("off" if on else "on"):
-            raise SceneError(
-                f"effects.{name}={given[name]} is not possible: {reason}; leave it out or change the other"
-            )
-        found[name] = replace(found[name], on=on, reason=reason, told=True)  # whatever images tell
-
     for name, choice in given.items():
         if choice == "on" and not found[name].on:
             raise SceneError(f"effects.{name}=on is not possible: {found[name].reason}; add that, or leave it out")
+    _part(found, given)
+    _put_on_ground(found, given)
+    return found
+
+
+def _turn(found: dict[str, Verdict], given: Mapping[str, str], name: str, on: bool, reason: str) -> None:
+    """Changes a verdict, whatever images tell. Raises SceneError where the contrary was asked for."""
+    if given.get(name) == ("off" if on else "on"):
+        raise SceneError(f"effects.{name}={given[name]} is not possible: {reason}; leave it out or change the other")
+    found[name] = replace(found[name], on=on, reason=reason, told=True)
+
+
+def _part(found: dict[str, Verdict], given: Mapping[str, str]) -> None:
+    """Leaves on, of effects that exclude each other, those that displace the others or were asked for."""
     for name in _on(found):
         others = [other for other in _on(found) if name in _effect(other).displaces]
         if others and given.get(name) == "on" and not any(given.get(other) == "on" for other in others):
             for other in others:
-                turn(other, False, f"{name} was asked for, and the two exclude each other")
+                _turn(found, given, other, False, f"{name} was asked for, and the two exclude each other")
         elif others:
-            turn(name, False, _effect(others[0]).displaces[name])
+            _turn(found, given, name, False, _effect(others[0]).displaces[name])
+
+
+def _put_on_ground(found: dict[str, Verdict], given: Mapping[str, str]) -> None:
+    """Turns on what effects stand on, or those off for which that was refused."""
     barred, wanted = ({name for name, choice in given.items() if choice == said} for said in ("off", "on"))
     waiting = _on(found)
     while waiting:
@@ -145,13 +155,12 @@ def reconcile(verdicts: Mapping[str, Verdict], given: Mapping[str, str] | None =
         if ground is None or found[ground].on:
             continue
         if ground in barred and name not in wanted:
-            turn(name, False, f"it stands on {ground}, which is off")
+            _turn(found, given, name, False, f"it stands on {ground}, which is off")
             barred.add(name)
         else:
-            turn(ground, True, f"{name} stands on it")
+            _turn(found, given, ground, True, f"{name} stands on it")
             wanted |= {ground} if name in wanted else set()
             waiting.append(ground)
-    return found
 
 
 def dependents(name: str) -> frozenset[str]:

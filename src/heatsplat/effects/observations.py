@@ -117,7 +117,7 @@ def observe(scene: SceneData) -> Observations:
         return Observations(
             scene, (), images, None, None, math.nan, False, None, "no training view has a thermal image"
         )
-    cameras, shape = [frame.camera for frame in frames], images.shape[1:]
+    cameras = [frame.camera for frame in frames]
     times = [frame.time_s for frame in frames]
     times_s = None if any(t is None for t in times) else torch.tensor(times, dtype=torch.float64)
     still = len(frames) > 1 and _stands_still(cameras, scene.points.double())
@@ -125,22 +125,28 @@ def observe(scene: SceneData) -> Observations:
     noise = noise_of(images, step, masks)
     if still:
         noise = max(noise_of_repeats(images, masks), step / math.sqrt(12.0), 1e-6)
-    tracks, why = None, ""
-    if len(frames) < MIN_FRAMES:
-        why = f"{len(frames)} training view(s) are too few to follow anything over"
-    elif min(shape) < MIN_PX:
-        why = f"images of {shape[1]} x {shape[0]} pixels are too small to follow a point through"
-    elif still:
+    tracks, why = None, _too_little(scene, len(frames), images.shape[1:], still)
+    if not why and still:
         tracks = _pixels(cameras[0], images, masks)
-    elif len(scene.points) < 1:
-        why = "the scene has no points to follow through the images"
-        if "points_random" in scene.notes:
-            why = "cannot be told: the scene has no points of its own, and its images too little texture to find some"
-    else:
+    elif not why:
         tracks = tracks_of(scene.points.double(), cameras, images, masks, noise)
         if tracks is None:
             why = f"no scene point is seen in {MIN_FRAMES} or more of {len(frames)} training views"
     return Observations(scene, tuple(frames), images, masks, times_s, noise, still, tracks, why)
+
+
+def _too_little(scene: SceneData, frames: int, shape: Sequence[int], still: bool) -> str:
+    """Why nothing can be followed through so many images of that shape; empty where something may be."""
+    height, width = shape
+    if frames < MIN_FRAMES:
+        return f"{frames} training view(s) are too few to follow anything over"
+    if min(height, width) < MIN_PX:
+        return f"images of {width} x {height} pixels are too small to follow a point through"
+    if still or len(scene.points):
+        return ""
+    if "points_random" in scene.notes:
+        return "cannot be told: the scene has no points of its own, and its images too little texture to find some"
+    return "the scene has no points to follow through the images"
 
 
 def read(

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from heatsplat.contracts import Frame, SceneData, SceneError, number_in
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, number_in
 from heatsplat.export.formats.base import optional
 from heatsplat.export.moment import Moment
 from heatsplat.geometry.alignment import Similarity, similarity_between
@@ -92,19 +92,8 @@ def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | No
     elif gps is not None:
         return _placed(scene, Path(gps).expanduser())
     cameras = [frame.camera for frame in scene.train.frames]
-    forward = torch.stack([camera.viewmat[2, :3] for camera in cameras]).mean(0)
     images_up = upward(cameras).double()
-    if above is not None:
-        up = above.double()
-    elif scene.weather is not None:
-        up = scene.weather.up.double()
-    elif _east_north_up(scene):
-        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    elif forward.norm() > ONE_WAY:
-        up = -forward
-    else:
-        up = images_up
-    up = normalize(up, dim=0)
+    up = normalize(above.double() if above is not None else _up(scene, cameras, images_up), dim=0)
     axes = torch.eye(3, dtype=torch.float64)
     # North is y of the world, unless that is (nearly) up; where the cameras look down their images' top.
     known = scene.weather is not None or _east_north_up(scene)
@@ -116,6 +105,16 @@ def place_of(scene: SceneData, gps: str | Path | None = None, above: Tensor | No
     scale = torch.tensor(1.0 if metres is None else metres, dtype=torch.float64)
     shift = torch.zeros(3, dtype=torch.float64)
     return Place(Similarity(scale, rotation, shift), None, "unit of the scene" if metres is None else "metre")
+
+
+def _up(scene: SceneData, cameras: Sequence[Camera], images_up: Tensor) -> Tensor:
+    """The direction [3] of up that a scene knows or its cameras tell."""
+    if scene.weather is not None:
+        return scene.weather.up.double()
+    if _east_north_up(scene):
+        return torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    forward = torch.stack([camera.viewmat[2, :3] for camera in cameras]).mean(0)
+    return -forward if forward.norm() > ONE_WAY else images_up
 
 
 def place_in_file(scene: SceneData, gps: str | Path | None = None, above: Tensor | None = None) -> Place:
@@ -275,13 +274,7 @@ def _positions(path: Path, flat: bool = False) -> dict[str, tuple[float, float, 
     Heights are those of the first column that has any: a preparation writes a column for each kind, empty where files do not
     say it. ``flat`` takes 0 where none has.
     """
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            head = file.readline()
-            file.seek(0)
-            rows = list(csv.DictReader(file, delimiter=max(",;\t", key=head.count)))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SceneError(f"{path} cannot be read: {error}") from error
+    rows = _rows(path)
     # Without None, under which stands what a row has beyond the last column.
     there = [column for column in rows[0] if column is not None] if rows else []
     filled = {column for column in there if any(_told(row, column) for row in rows)}
@@ -312,6 +305,16 @@ def _positions(path: Path, flat: bool = False) -> dict[str, tuple[float, float, 
         raise SceneError(f"{path}: {wrong[0]} lies nowhere on the earth, at latitude {found[wrong[0]][0]:g} and longitude "
                          f"{found[wrong[0]][1]:g} degrees")  # fmt: skip
     return found
+
+
+def _rows(path: Path) -> list[dict[str, str | None]]:
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            head = file.readline()
+            file.seek(0)
+            return list(csv.DictReader(file, delimiter=max(",;\t", key=head.count)))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SceneError(f"{path} cannot be read: {error}") from error
 
 
 def _told(row: Mapping[str, str | None], column: str) -> str:

@@ -52,22 +52,13 @@ def write_splats(
         "quats": quats,
         "opacity_logits": opacity_logits,
         "values": values,
+        "sh_rest": sh_rest,
+        "temperature_k": temperature_k,
     }
-    given |= {"sh_rest": sh_rest, "temperature_k": temperature_k}
     arrays = {key: np.asarray(value, dtype=np.float32) for key, value in given.items() if value is not None}
-    count = len(arrays["means"])
     arrays["opacity_logits"] = arrays["opacity_logits"].reshape(-1, 1)
-    shapes = {"means": (count, 3), "log_scales": (count, 3), "quats": (count, 4), "opacity_logits": (count, 1)}
-    shapes["values"] = (count, 3 if arrays["values"].shape[1:] == (3,) else 1)
-    if sh_rest is not None:
-        shapes["sh_rest"] = (count, arrays["sh_rest"].shape[1], shapes["values"][1])
-    if temperature_k is not None:
-        shapes["temperature_k"] = (count,)
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, got {list(arrays[name].shape)}")
-        if not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{name} has values that are NaN or infinite; viewers would show nothing at all")
+    _check(arrays)
+    count = len(arrays["means"])
 
     colors = arrays["values"]
     if colormap is not None and colors.shape[1] == 1:
@@ -102,6 +93,26 @@ def write_splats(
     path.parent.mkdir(parents=True, exist_ok=True)
     PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(path))
     return int(seen.sum())
+
+
+def _check(arrays: Mapping[str, np.ndarray]) -> None:
+    """Raises ValueError where an array of ``write_splats`` has not the shape it must have, or is not finite."""
+    count, channels = len(arrays["means"]), 3 if arrays["values"].shape[1:] == (3,) else 1
+    shapes = {
+        "means": (count, 3),
+        "log_scales": (count, 3),
+        "quats": (count, 4),
+        "opacity_logits": (count, 1),
+        "values": (count, channels),
+        "temperature_k": (count,),
+    }
+    if "sh_rest" in arrays:
+        shapes["sh_rest"] = (count, arrays["sh_rest"].shape[1], channels)
+    for name, values in arrays.items():
+        if values.shape != shapes[name]:
+            raise ValueError(f"{name} must have shape {list(shapes[name])}, got {list(values.shape)}")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} has values that are NaN or infinite; viewers would show nothing at all")
 
 
 def read_splats(path: str | Path) -> dict[str, np.ndarray]:

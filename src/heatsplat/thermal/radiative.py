@@ -95,12 +95,8 @@ class Radiative(Wrapper):
         check_option("law", law, LAWS)
         check_option("clip", clip, CLIPS)
         measured = surroundings == MEASURED
-        if not (
-            0 < emissivity < 1
-            and 0 < reflectance_start < 1
-            and (measured or 0 < surroundings < 1)
-            and (gain is None or gain > 0)
-        ):
+        shares = [emissivity, reflectance_start, *([] if measured else [surroundings])]
+        if not (all(0 < share < 1 for share in shares) and (gain is None or gain > 0)):
             raise ValueError(
                 "emissivity, reflectance_start and surroundings (or measured) lie between 0 and 1 and gain is positive, got "
                 f"{emissivity}, {reflectance_start}, {surroundings} and {gain}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,14 +90,7 @@ class Map(Format):
         place = place_in_file(scene, self.gps, self.above)
         west, north, pixel, width, height = self._grid(scene, place)
         grid = from_origin(west, north, pixel, pixel)
-        other = None if self.against is None else _other(rasterio, self.against)
-        if other is not None and not (
-            other.values.shape == (height, width) and grid.almost_equals(other.grid, 1e-3 * pixel)
-        ):
-            raise SceneError(
-                f"what.against={self.against} has {_described(other.grid, *other.values.shape)}, this map "
-                f"{_described(grid, height, width)}: write both with the same what.resolution and what.bounds"
-            )
+        other = None if self.against is None else self._other(rasterio, grid, width, height)
         camera = _from_above(scene, place, west, north, pixel, width, height)
         depth, bands = self._bands(moment, camera)
         title, own = next(iter(bands.items()))
@@ -134,19 +127,23 @@ class Map(Format):
                 method=_method(moment),
                 scene=scene.name,
             )
-        unit = moment.seen.unit
         if other is None:
-            write_png(path.with_suffix(".png"), _picture(own, moment, place, pixel))
-            return
-        _say_shift(other, own, pixel, place.unit, unit, self.against)
-        recorded, owner = mosaic(scene, surface_points(camera, smoothed(depth)))
-        before, now = other.method, _method(moment)
-        if other.scene != scene.name:
-            before, now = f"{before}, {other.scene}", f"{now}, {scene.name}"
-        names = ("images", before, now if now != before else f"{now}, this run")
-        maps = dict(zip(names, (recorded, other.values, own), strict=True))
-        spread = next((band for title, band in bands.items() if title.startswith(DEVIATION)), None)
-        write_png(path.with_suffix(".png"), comparison(maps, owner, unit or IMAGE_VALUES, spread))
+            picture = _picture(own, moment, place, pixel)
+        else:
+            _say_shift(other, own, pixel, place.unit, moment.seen.unit, self.against)
+            recorded, owner = mosaic(scene, surface_points(camera, smoothed(depth)))
+            picture = _compared(moment, bands, other, recorded, owner)
+        write_png(path.with_suffix(".png"), picture)
+
+    def _other(self, rasterio: Any, grid: Any, width: int, height: int) -> _Other:
+        """The map to compare with. Raises SceneError where it cannot be read or its pixels are not those of this one."""
+        other = _read_other(rasterio, self.against)
+        if other.values.shape == (height, width) and grid.almost_equals(other.grid, 1e-3 * grid.a):
+            return other
+        raise SceneError(
+            f"what.against={self.against} has {_described(other.grid, *other.values.shape)}, this map "
+            f"{_described(grid, height, width)}: write both with the same what.resolution and what.bounds"
+        )
 
     def _grid(self, scene: SceneData, place: Place) -> tuple[float, float, float, int, int]:
         """West and north edge, width of a pixel, columns and rows.
@@ -228,7 +225,7 @@ class _Other:
     title: str | None  # what the band holds, where heatsplat wrote it
 
 
-def _other(rasterio: Any, path: Path) -> _Other:
+def _read_other(rasterio: Any, path: Path) -> _Other:
     """A map that was written before. Raises SceneError where it cannot be read."""
     try:
         with rasterio.open(path) as file:
@@ -257,6 +254,20 @@ def _say_shift(other: _Other, own: np.ndarray, pixel: float, unit: str, values: 
         path, columns * pixel, unit, -rows * pixel, there, here, "; a difference of the two shows that shift" * moved,
     )  # fmt: skip
     log.info("what.against is %.2f %s warmer than this map in the median, which their difference holds", level, values)
+
+
+def _compared(
+    moment: Moment, bands: Mapping[str, np.ndarray], other: _Other, recorded: np.ndarray, owner: np.ndarray
+) -> np.ndarray:
+    """The picture of a map beside the images and another map."""
+    scene = moment.module.scene
+    before, now = other.method, _method(moment)
+    if other.scene != scene.name:
+        before, now = f"{before}, {other.scene}", f"{now}, {scene.name}"
+    names = ("images", before, now if now != before else f"{now}, this run")
+    maps = dict(zip(names, (recorded, other.values, next(iter(bands.values()))), strict=True))
+    spread = next((band for title, band in bands.items() if title.startswith(DEVIATION)), None)
+    return comparison(maps, owner, moment.seen.unit or IMAGE_VALUES, spread)
 
 
 def _picture(values: np.ndarray, moment: Moment, place: Place, pixel: float) -> np.ndarray:

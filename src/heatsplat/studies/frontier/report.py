@@ -125,7 +125,7 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
     """
     every = list(dict.fromkeys(recipe.scene for recipe in recipes))
     scenes = every[:DRAWN]
-    places = {name: j for j, name in enumerate(sorted({recipe.name for recipe in recipes}))}
+    looks = {name: series_look(j) for j, name in enumerate(sorted({recipe.name for recipe in recipes}))}
     figure = Figure(figsize=(11, 4.4 * len(scenes)), dpi=110, layout="constrained")
     if len(scenes) < len(every):
         figure.suptitle(f"the first {len(scenes)} of {len(every)} scenes; the tables have all")
@@ -133,23 +133,7 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
         own = [recipe for recipe in recipes if recipe.scene == scene]
         for k, name in enumerate(SCORES):
             axes = figure.add_subplot(len(scenes), 2, 2 * i + k + 1)
-            for recipe in own:
-                color, mark = series_look(places[recipe.name])
-                for course in recipe.table["course"]:
-                    if course[name]:
-                        axes.plot(*zip(*course[name], strict=True), color=color, linewidth=0.8, alpha=0.5)
-                x, y = recipe.mean("train_seconds"), recipe.mean(name)
-                if x is not None and y is not None:
-                    edge = "black" if recipe.on_front.get(name) else color
-                    axes.errorbar(
-                        x, y, recipe.spread(name) or 0, color=color, marker=mark, markeredgecolor=edge, capsize=2,
-                        linestyle="", label=literal(recipe.name),
-                    )  # fmt: skip
-            sign = DEFINITIONS[name].sign
-            every = [(s, sign * value) for recipe in own for s, value in recipe.points(name)]
-            front = sorted((s, sign * q) for s, q in every if not dominated(s, q, every))
-            if len(front) > 1:
-                axes.step(*zip(*front, strict=True), where="post", color="black", linewidth=0.8, linestyle="--")
+            _draw(axes, own, name, looks)
             label = DEFINITIONS[name].heading
             axes.set(xlabel="seconds of training", ylabel=label, title=literal(scene), xscale="log")
             if name == "mae_c":
@@ -161,3 +145,24 @@ def picture(recipes: Sequence[Recipe]) -> Figure:
             if k == 0 and own:
                 axes.legend(fontsize=7)
     return figure
+
+
+def _draw(axes: Any, recipes: Sequence[Recipe], name: str, looks: Mapping[str, tuple[str, str]]) -> None:
+    """One score of the recipes of a scene, and the front of their points."""
+    for recipe in recipes:
+        color, mark = looks[recipe.name]
+        for course in recipe.table["course"]:
+            if course[name]:
+                axes.plot(*zip(*course[name], strict=True), color=color, linewidth=0.8, alpha=0.5)
+        x, y = recipe.mean("train_seconds"), recipe.mean(name)
+        if x is not None and y is not None:
+            edge = "black" if recipe.on_front.get(name) else color
+            axes.errorbar(
+                x, y, recipe.spread(name) or 0, color=color, marker=mark, markeredgecolor=edge, capsize=2,
+                linestyle="", label=literal(recipe.name),
+            )  # fmt: skip
+    sign = DEFINITIONS[name].sign
+    points = [(s, sign * value) for recipe in recipes for s, value in recipe.points(name)]
+    front = sorted((s, sign * q) for s, q in points if not dominated(s, q, points))
+    if len(front) > 1:
+        axes.step(*zip(*front, strict=True), where="post", color="black", linewidth=0.8, linestyle="--")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -143,18 +143,24 @@ def compare(reproduction: Reproduction, results: Mapping[tuple[str, str], Runs])
                 _fill(reproduction, line, have, results)
             lines.append(line)
     for line, have in incomplete:
-        if not have:
-            continue
-        name = f"{THAT_RAN}, {line.scene}" if line.scene in reproduction.source.groups else THAT_RAN
-        part = Line(name, line.method, line.setting, line.members)
-        _fill(reproduction, part, have, results)
-        per_scene = [printed.get((scene, line.method, line.setting), {}) for scene in have]
-        for metric in line.printed:
-            values = [figures[metric].value for figures in per_scene if metric in figures]
-            if len(values) == len(have) and None not in values:
-                part.theirs[metric] = statistics.fmean(values)
-        lines.append(part)
+        if have:
+            name = f"{THAT_RAN}, {line.scene}" if line.scene in reproduction.source.groups else THAT_RAN
+            part = Line(name, line.method, line.setting, line.members)
+            _fill(reproduction, part, have, results)
+            per_scene = [printed.get((scene, line.method, line.setting), {}) for scene in have]
+            part.theirs = _printed_means(line.printed, per_scene)
+            lines.append(part)
     return lines
+
+
+def _printed_means(metrics: Iterable[str], per_scene: Sequence[Mapping[str, Figure]]) -> dict[str, float]:
+    """The mean over scenes of each metric that is printed for all of them."""
+    means = {}
+    for metric in metrics:
+        values = [figures[metric].value for figures in per_scene if metric in figures]
+        if len(values) == len(per_scene) and None not in values:
+            means[metric] = statistics.fmean(values)
+    return means
 
 
 def _of(results: Mapping[tuple[str, str], Runs], method: str, setting: str, scene: str) -> Runs | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -143,28 +143,9 @@ def picture(panels: Sequence[Panel], clock: str) -> Figure:
     looks[None] = ("black", "o")
     figure = Figure(figsize=(11, 4.4 * len(panels)), dpi=110, layout="constrained")
     for i, panel in enumerate(panels):
-        scores = _scores(panel)
-        for k, score in enumerate(scores):
+        for k, score in enumerate(_scores(panel)):
             axes = figure.add_subplot(len(panels), len(SCORES), len(SCORES) * i + k + 1)
-            standard = []
-            for own in panel.groups():
-                color, mark = looks[own[0].recipe]
-                for one in own:
-                    if one.course[score]:
-                        axes.plot(*zip(*one.course[score], strict=True), color=color, linewidth=0.6, alpha=0.4)
-                x = [one.seconds for one in own]
-                y = [one.scores[score] for one in own]
-                spread = [statistics.stdev(values) if len(own) > 1 else 0.0 for values in (y, x)]
-                end = (statistics.fmean(x), statistics.fmean(y))
-                name = literal(named(panel, own[0]))
-                axes.errorbar(*end, *spread, color=color, marker=mark, capsize=2, linestyle="", label=name)
-                if own[0].recipe is None:
-                    standard.append(end)
-            if len(standard) > 1:
-                axes.plot(*zip(*sorted(standard), strict=True), color="black", linewidth=1.2)
-            last = statistics.fmean(one.scores[score] for one in panel.references.values())
-            axes.axhline(last, color="black", linewidth=0.8, linestyle="--")
-            axes.axhline(panel.level(score, last), color="black", linewidth=0.8, linestyle=":")
+            _draw(axes, panel, score, looks)
             label = DEFINITIONS[score].heading
             axes.set(xlabel=CLOCK_LABELS[clock], ylabel=label, title=literal(panel.title), xscale="log")
             _near(axes, panel, score)
@@ -173,6 +154,29 @@ def picture(panels: Sequence[Panel], clock: str) -> Figure:
             if k == 0:
                 axes.legend(fontsize=7)
     return figure
+
+
+def _draw(axes: Any, panel: Panel, score: str, looks: Mapping[str | None, tuple[str, str]]) -> None:
+    """One score of a panel's runs, and the levels of the reference."""
+    standard = []
+    for own in panel.groups():
+        color, mark = looks[own[0].recipe]
+        for one in own:
+            if one.course[score]:
+                axes.plot(*zip(*one.course[score], strict=True), color=color, linewidth=0.6, alpha=0.4)
+        x = [one.seconds for one in own]
+        y = [one.scores[score] for one in own]
+        spread = [statistics.stdev(values) if len(own) > 1 else 0.0 for values in (y, x)]
+        end = (statistics.fmean(x), statistics.fmean(y))
+        name = literal(named(panel, own[0]))
+        axes.errorbar(*end, *spread, color=color, marker=mark, capsize=2, linestyle="", label=name)
+        if own[0].recipe is None:
+            standard.append(end)
+    if len(standard) > 1:
+        axes.plot(*zip(*sorted(standard), strict=True), color="black", linewidth=1.2)
+    last = statistics.fmean(one.scores[score] for one in panel.references.values())
+    axes.axhline(last, color="black", linewidth=0.8, linestyle="--")
+    axes.axhline(panel.level(score, last), color="black", linewidth=0.8, linestyle=":")
 
 
 def _near(axes: Any, panel: Panel, score: str) -> None:
