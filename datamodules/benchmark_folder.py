@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
-from heatsplat.contracts import SceneData, SceneError, View
+from heatsplat.contracts import SceneData, SceneError, View, ViewSet
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.formats.colmap import pinholes, write_model
 from heatsplat.datamodules.posed_frames import FILES
@@ -96,6 +96,34 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
     """
     if scene.thermal_range is None:
         raise SceneError(f"scene {scene.name} has no temperatures, and the protocol scores °C")
+    _check_names(scene)
+    for subset, views in (("train", scene.train), ("test", scene.test)):
+        _write_views(scene, subset, views, folder, truth, prefix * (subset == "test"))
+    _write_points(scene, folder)
+    meta = {
+        **also,
+        "scene": scene.name,
+        "min_value": scene.thermal_range.min_c,
+        "max_value": scene.thermal_range.max_c,
+        "ambient_c": scene.ambient_c,
+        "metres_per_unit": scene.metres_per_unit,
+    }
+    if scene.weather is not None:
+        write_weather(folder / WEATHER_FILE, scene.weather)
+        notes = scene.weather.notes
+        site = ("latitude", "longitude", "altitude_m", "up", "north")
+        meta |= {key: notes[key] for key in site if key in notes} | {"utc_at_zero_s": notes.get("utc_at_zero_s")}
+    if scene.true_attributes is not None:
+        known = scene.true_attributes(scene.points)
+        columns = (values.double().numpy() for values in known.values())
+        table = np.stack([*scene.points.double().numpy().T, *columns], axis=1)
+        head = ",".join(["x", "y", "z", *known])
+        np.savetxt(truth / "materials.csv", table, fmt="%.7g", delimiter=",", header=head, comments="")
+    _json(folder / META, meta)
+
+
+def _check_names(scene: SceneData) -> None:
+    """Raises SceneError where two images would have one file."""
     for views in (scene.train, scene.test):
         stems = Counter(Path(frame.name).stem for frame in views.frames)
         if twice := [frame.name for frame in views.frames if stems[Path(frame.name).stem] > 1]:
@@ -103,22 +131,28 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
                 f"images of scene {scene.name} such as {twice[0]} and {twice[1]} have one name in several folders, and would be "
                 "one file of the protocol; give them names of their own"
             )
-    clock = None if scene.weather is None else scene.weather.notes.get("utc_at_zero_s")
-    for subset, views in (("train", scene.train), ("test", scene.test)):
-        frames = []
-        for view in views:
-            name, camera = prefix * (subset == "test") + Path(view.frame.name).stem, view.camera
-            entry = {"file_path": f"images/{name}.png" if view.rgb is not None else f"thermal/{name}.tiff"}
-            entry |= {"thermal_file_path": f"thermal/{name}.tiff", "time_s": view.time_s}
-            frames.append(entry | camera_entry(camera))
-            if subset == "train":
-                _tiff(folder / "thermal" / f"{name}.tiff", _celsius(scene, view, "thermal"))
-            else:
-                _tiff(truth / f"{name}.tiff", _celsius(scene, view, "clean"))
-            if view.rgb is not None:
-                place = folder if subset == "train" else truth
-                _png(place / "images" / f"{name}.png", (view.rgb.numpy() * 255.0).round().astype(np.uint8))
-        _json(folder / FILES[subset], {"camera_model": "PINHOLE", "ply_file_path": "points3D.ply", "frames": frames})
+
+
+def _write_views(scene: SceneData, subset: str, views: ViewSet, folder: Path, truth: Path, prefix: str) -> None:
+    """The cameras of a subset, in ``folder``, and its images: as recorded in there for training, clean in ``truth`` for test."""
+    frames = []
+    for view in views:
+        name = prefix + Path(view.frame.name).stem
+        entry = {"file_path": f"images/{name}.png" if view.rgb is not None else f"thermal/{name}.tiff"}
+        entry |= {"thermal_file_path": f"thermal/{name}.tiff", "time_s": view.time_s}
+        frames.append(entry | camera_entry(view.camera))
+        if subset == "train":
+            _tiff(folder / "thermal" / f"{name}.tiff", _celsius(scene, view, "thermal"))
+        else:
+            _tiff(truth / f"{name}.tiff", _celsius(scene, view, "clean"))
+        if view.rgb is not None:
+            place = folder if subset == "train" else truth
+            _png(place / "images" / f"{name}.png", (view.rgb.numpy() * 255.0).round().astype(np.uint8))
+    _json(folder / FILES[subset], {"camera_model": "PINHOLE", "ply_file_path": "points3D.ply", "frames": frames})
+
+
+def _write_points(scene: SceneData, folder: Path) -> None:
+    """The points as PLY and, with the training cameras, as a model of COLMAP, and what is known of each."""
     points = scene.points.double().numpy()
     colors = np.full_like(points, 0.5) if scene.point_colors is None else scene.point_colors.double().numpy()
     colors = (colors * 255.0).round().astype(np.uint8)
@@ -131,24 +165,6 @@ def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, 
         np.save(folder / LABELS_FILE, scene.labels.numpy())
     if scene.point_features is not None:
         np.save(folder / FEATURES_FILE, scene.point_features.numpy())
-    meta = {
-        **also,
-        "scene": scene.name,
-        "min_value": scene.thermal_range.min_c,
-        "max_value": scene.thermal_range.max_c,
-        "ambient_c": scene.ambient_c,
-        "metres_per_unit": scene.metres_per_unit,
-    }
-    if scene.weather is not None:
-        write_weather(folder / WEATHER_FILE, scene.weather)
-        site = ("latitude", "longitude", "altitude_m", "up", "north")
-        meta |= {key: scene.weather.notes[key] for key in site if key in scene.weather.notes} | {"utc_at_zero_s": clock}
-    if scene.true_attributes is not None:
-        known = scene.true_attributes(scene.points)
-        table = np.stack([*points.T, *(values.double().numpy() for values in known.values())], axis=1)
-        head = ",".join(["x", "y", "z", *known])
-        np.savetxt(truth / "materials.csv", table, fmt="%.7g", delimiter=",", header=head, comments="")
-    _json(folder / META, meta)
 
 
 def _celsius(scene: SceneData, view: View, which: str) -> np.ndarray:

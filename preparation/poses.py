@@ -273,7 +273,7 @@ class Search:
         write_world(self.target, None if self.origin is None else 1.0, EAST_NORTH_UP)
         missing = self._why_not({copy for copy in self.name_of if copy not in kept}, others)
         errors = self._gps_residuals(list(written.images.values()))
-        cameras = {self._device(copy): image.camera for copy, image in kept.items()}
+        cameras = dict(sorted({self._device(copy): image.camera for copy, image in kept.items()}.items()))
         values: dict[str, Any] = {
             "registered": len(kept),
             "frames": len(self.frames),
@@ -281,7 +281,7 @@ class Search:
             "reprojection_error_px": round(model.compute_mean_reprojection_error(), 4),
             "cameras": {
                 self.devices[i].label: {"model": c.model.name, "params": [round(float(p), 6) for p in c.params]}
-                for i, c in sorted(cameras.items())
+                for i, c in cameras.items()
             },
             "not_registered": missing,
             "metres_per_unit": None if self.origin is None else 1.0,
@@ -294,7 +294,7 @@ class Search:
                 f"Camera{f' {self.devices[i].label}' if len(self.devices) > 1 else ''}: {c.model.name}, "
                 f"{', '.join(f'{p:.5g}' for p in c.params)} (distortion is taken out of the temperatures when the scene is "
                 "loaded, as floating point)."
-                for i, c in sorted(cameras.items())
+                for i, c in cameras.items()
             ),
         ]
         if errors is not None:
@@ -313,15 +313,8 @@ class Search:
                 f"The thermal camera is turned by {turn:.2f}° against the visible one and stands at ({where}) in its axes "
                 "(right, down, forward), as far as they tell: both are brought to the same places in the mean."
             )
-        by_name = {image.name: image for image in written.images.values()}
-        placed = [by_name[name] for name in self.frames if name in by_name]
         if len(written.points3D) > 2:
-            draw_cameras(
-                self.target / PICTURE,
-                [pose_matrix(image) for image in placed],
-                np.array([point.xyz for point in written.points3D.values()]),
-                self.origin is not None,
-            )
+            self._draw(written)
             lines += ["", f"![cameras over the points]({PICTURE})", ""]
         if missing:
             lines.append(
@@ -330,6 +323,16 @@ class Search:
             )
         lines += ["", *(f"- {name}: {reason}" for name, reason in missing.items())]
         return Section("Poses", lines, values)
+
+    def _draw(self, written: pycolmap.Reconstruction) -> None:
+        """The picture of the cameras, in the order of the frames."""
+        by_name = {image.name: image for image in written.images.values()}
+        draw_cameras(
+            self.target / PICTURE,
+            [pose_matrix(by_name[name]) for name in self.frames if name in by_name],
+            np.array([point.xyz for point in written.points3D.values()]),
+            self.origin is not None,
+        )
 
     def _made_of(self) -> str:
         """What copies, features and matches depend on: the files as the camera wrote them, but not the conditions."""

@@ -147,33 +147,10 @@ def radiometry(
     frame, record = frames[usable[len(usable) // 2]], records[usable[len(usable) // 2]]
     response, c = frame.calibration.response, frame.conditions
     celsius = torch.tensor([record["quantiles"][k] for k in (LOW, MIDDLE, HIGH)], dtype=torch.float64)
-    surface = celsius + KELVIN_AT_0_C
-    signal = measured_signal(surface, response, c)
+    signal = measured_signal(celsius + KELVIN_AT_0_C, response, c)
     standard = uncertain.standard(c)
     parts = uncertainty(signal, response, c, standard)
-
-    def three(values: torch.Tensor, form: str) -> list[str]:
-        return ["" if not np.isfinite(x) else format(x, form) for x in values.tolist()]
-
     head = ["", "value", "from", *(f"changes {x:.1f} °C by" for x in celsius.tolist())]
-    table = []
-    for name in LIMITS:
-        value = float(getattr(c, name))
-        shown = value - KELVIN_AT_0_C if name.endswith("_k") else 100 * value if name == "humidity" else value
-        change = [""] * 3
-        if name in NEUTRAL and value != NEUTRAL[name]:
-            change = three(surface - surface_temperature(signal, response, replace(c, **{name: NEUTRAL[name]})), "+.2f")
-        table.append(
-            [LABELS[name], f"{shown:.4g}{SUFFIX.get(name, '')}", frame.sources.get(name, "no correction"), *change]
-        )
-    unsure = [
-        [LABELS[name], _plus_minus(name, value), *three(parts[name], ".2f")]
-        for name, value in sorted(standard.items(), key=lambda item: -float(parts[item[0]].nan_to_num().max()))
-        if value
-    ]
-    unsure.append(["**all, standard**", "", *three(parts["combined"], ".2f")])
-    unsure.append(["**all, expanded (k = 2, 95 %)**", "", *three(2 * parts["combined"], ".2f")])
-    unsure = [row for row in unsure if any(float(cell or 0.0) for cell in row[2:])]
     different = len({repr(f.conditions) for f in frames})
     stated = [
         f"Temperatures of surfaces, frame {plain(frame.name)}; the air lets {float(c.transmittance()):.4f} pass.",
@@ -183,14 +160,16 @@ def radiometry(
             else []
         ),
         "",
-        *markdown_table(head, table, "llrrrr"[: len(head)]),
+        *markdown_table(head, _conditions(frame, celsius + KELVIN_AT_0_C, signal), "llrrrr"[: len(head)]),
     ]
     lines = [
         *(stated if any(_is_corrected(f) for f in frames) else [APPARENT]),
         "",
         "Uncertainty in °C by the GUM's law of propagation, for inputs that are independent of each other:",
         "",
-        *markdown_table(["input", "±", *(f"at {x:.1f} °C" for x in celsius.tolist())], unsure, "llrrr"),
+        *markdown_table(
+            ["input", "±", *(f"at {x:.1f} °C" for x in celsius.tolist())], _unsure(standard, parts), "llrrr"
+        ),
     ]
     values = {"combined_c": parts["combined"].tolist(), "at_c": celsius.tolist()}
     apparent_c = float(surface_temperature(signal, response, Conditions())[1]) - KELVIN_AT_0_C
@@ -202,6 +181,37 @@ def radiometry(
             "Check emissivity, reflected temperature and window under Radiometry."
         )
     return Section("Radiometry", lines, values, findings)
+
+
+def _conditions(frame: ThermalFrame, surface: torch.Tensor, signal: torch.Tensor) -> list[list[str]]:
+    """A row for each condition: its value, where it comes from, and what it changes at temperatures of surfaces in kelvin."""
+    rows, c = [], frame.conditions
+    for name in LIMITS:
+        value = float(getattr(c, name))
+        shown = value - KELVIN_AT_0_C if name.endswith("_k") else 100 * value if name == "humidity" else value
+        change = [""] * 3
+        if name in NEUTRAL and value != NEUTRAL[name]:
+            without = surface_temperature(signal, frame.calibration.response, replace(c, **{name: NEUTRAL[name]}))
+            change = _cells(surface - without, "+.2f")
+        source = frame.sources.get(name, "no correction")
+        rows.append([LABELS[name], f"{shown:.4g}{SUFFIX.get(name, '')}", source, *change])
+    return rows
+
+
+def _unsure(standard: Mapping[str, float], parts: Mapping[str, torch.Tensor]) -> list[list[str]]:
+    """A row for each input whose uncertainty can be seen in its parts, the largest first, and for all of them."""
+    rows = [
+        [LABELS[name], _plus_minus(name, value), *_cells(parts[name], ".2f")]
+        for name, value in sorted(standard.items(), key=lambda item: -float(parts[item[0]].nan_to_num().max()))
+        if value
+    ]
+    rows.append(["**all, standard**", "", *_cells(parts["combined"], ".2f")])
+    rows.append(["**all, expanded (k = 2, 95 %)**", "", *_cells(2 * parts["combined"], ".2f")])
+    return [row for row in rows if any(float(cell or 0.0) for cell in row[2:])]
+
+
+def _cells(values: torch.Tensor, form: str) -> list[str]:
+    return [format(x, form) if np.isfinite(x) else "" for x in values.tolist()]
 
 
 def _is_corrected(frame: ThermalFrame) -> bool:

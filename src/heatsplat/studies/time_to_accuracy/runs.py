@@ -7,6 +7,7 @@ import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -187,24 +188,19 @@ def panels_of(
     cases = [listed(case) for case in cases]
     runs = runs.assign(further=[further_of(overrides, cases) for overrides in runs["overrides"]])
     scenes = [", ".join([f"{one.method} on {one.scene}", *one.further]) for one in runs.itertuples()]
-    panels: dict[str, Panel] = {}
+
+    def recipe_of(told: frozenset[str]) -> str | None:
+        if frozenset(without_length(told)) == usual and told not in names:
+            return None
+        return names.get(told, " ".join(sorted(told)) or "defaults")
+
+    panels: list[Panel] = []
     of_title = runs.assign(title=panel_titles(runs.assign(scene=scenes))).groupby("title", sort=False)
     for title, own in of_title:
         settings = [{*_told(one.overrides)} - {*common, *one.further} for one in own.itertuples()]
         shared = {text for text in set.intersection(*settings) if text.startswith("data.")}
-        panel, kept = Panel(title, margins), {}
-        for one, told in zip(own.itertuples(), settings, strict=True):
-            told = frozenset(told - shared)
-            standard = frozenset(without_length(told)) == usual and told not in names
-            name = None if standard else names.get(told, " ".join(sorted(told)) or "defaults")
-            outcome = _outcome(one, name, clock)
-            if outcome is None:
-                log.warning("%s is left out: it does not tell its %s, PSNR and Gaussians", one.folder, clock)
-                continue
-            if (key := (*outcome.kind, outcome.seed)) in kept:
-                log.warning("%s is left out: a later run of its recipe and seed counts, %s", kept[key][1], one.folder)
-            kept[key] = outcome, one.folder
-        panel.outcomes += (outcome for outcome, _ in kept.values())
+        told = [recipe_of(frozenset(texts - shared)) for texts in settings]
+        panel = Panel(title, margins, outcomes=_last_of_each(own, told, clock))
         panel.references |= {one.seed: one for one in panel.outcomes if one.recipe is None and one.steps == length}
         for lone in [one for one in panel.outcomes if one.seed not in panel.references]:
             log.warning(
@@ -213,8 +209,22 @@ def panels_of(
             )  # fmt: skip
             panel.outcomes.remove(lone)
         if panel.outcomes:
-            panels[title] = panel
-    return list(panels.values())
+            panels.append(panel)
+    return panels
+
+
+def _last_of_each(runs: pd.DataFrame, recipes: Sequence[str | None], clock: str) -> list[Outcome]:
+    """The last run of each recipe and seed; those without the numbers are left out."""
+    kept: dict[tuple, tuple[Outcome, Path]] = {}
+    for one, recipe in zip(runs.itertuples(), recipes, strict=True):
+        outcome = _outcome(one, recipe, clock)
+        if outcome is None:
+            log.warning("%s is left out: it does not tell its %s, PSNR and Gaussians", one.folder, clock)
+            continue
+        if (key := (*outcome.kind, outcome.seed)) in kept:
+            log.warning("%s is left out: a later run of its recipe and seed counts, %s", kept[key][1], one.folder)
+        kept[key] = outcome, one.folder
+    return [outcome for outcome, _ in kept.values()]
 
 
 def _outcome(one: Any, name: str | None, clock: str) -> Outcome | None:
