@@ -1,9 +1,10 @@
 """Planes through points and normals of depth maps, against planes that are known."""
 
+import pytest
 import torch
 
 from heatsplat.contracts import Camera
-from heatsplat.geometry.surfaces import depth_normals, on_the_side_of, plane_axes
+from heatsplat.geometry.surfaces import depth_normals, on_the_side_of, plane_axes, plane_thickness
 from heatsplat.training.rng import generator_for
 
 
@@ -45,3 +46,27 @@ def test_a_depth_map_of_a_plane_gives_its_normal_towards_the_camera_and_nothing_
     assert torch.allclose(found[:, 10:], expected.expand(24, 22, 3), atol=1e-9)
     assert (found[:, :7] == 0).all()
     assert found.isfinite().all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_planes_end_at_an_edge(noise):
+    """A floor and a wall that meet: only points that lie on both may have another plane than theirs."""
+    flat, scatter = drawn(800, 2), noise * (drawn(800) - 0.5)
+    floor = torch.stack([flat[:400, 0], flat[:400, 1], scatter[:400]], dim=1)
+    wall = torch.stack([flat[400:, 0], scatter[400:], flat[400:, 1]], dim=1)
+    points = torch.cat([floor, wall])
+    normals = plane_axes(points, points, 12)[0][..., 2].abs()
+    expected = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64).repeat_interleave(400, dim=0)
+    off = torch.rad2deg(torch.acos((normals * expected).sum(1).clamp(max=1.0)))
+    beside = torch.cat([flat[:400, 1], flat[400:, 1]])
+    assert (off[beside > 0.03] < 5.0).float().mean() > 0.98
+    # Planes through the nearest points alone cut the corner as far as those reach, about 0.1.
+    own = plane_thickness(points, points, 12)[0][..., 2].abs()
+    cut = torch.rad2deg(torch.acos((own * expected).sum(1).clamp(max=1.0)))
+    assert (cut[(beside > 0.03) & (beside < 0.1)] > 5.0).float().mean() > 0.5
+
+
+def test_planes_at_places_beside_the_points_are_theirs():
+    points = torch.cat([drawn(100, 2), torch.zeros(100, 1)], dim=1)
+    axes, far = plane_axes(points, torch.tensor([[0.5, 0.5, 0.3]]), 8)
+    assert axes.shape == (1, 3, 3) and float(axes[0, 2, 2].abs()) == pytest.approx(1.0) and 0.3 < float(far) < 0.4
