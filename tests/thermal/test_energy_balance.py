@@ -318,7 +318,8 @@ def test_a_night_only_record_works_without_sun():
     ("options", "message"),
     [
         ({"clip": "soft"}, "clip must be one of"),
-        ({"share_prior": -1.0}, "share_prior must not be negative, got -1.0"),
+        ({"material_weight": 0.0}, "material_weight must be above zero, got 0.0; materials=null is without"),
+        ({"materials": 0}, "materials must be at least 1, or null for none, got 0"),
     ],
 )
 def test_unknown_options_are_named(options, message):
@@ -328,6 +329,7 @@ def test_unknown_options_are_named(options, message):
 
 def test_the_yaml_builds_the_defaults_of_the_class():
     settings = OmegaConf.load("conf/thermal/energy_balance.yaml")
+    settings.materials_from = 0  # a share of the run
     built, plain = instantiate(settings), EnergyBalance()
     assert built.options == plain.options
     for name, value in vars(plain).items():
@@ -494,30 +496,35 @@ def test_convection_that_was_measured_is_what_the_balance_has():
 
 
 @pytest.mark.parametrize("solution", ["linear", "corrected"])
-def test_shares_are_pulled_to_the_mean_of_all_and_only_they(solution):
-    model, splats = ready(solution=solution, share_prior=0.3)
-    for name in ("raw_share", "raw_wind"):
+def test_what_materials_have_in_common_is_held_from_their_step_on(solution):
+    """One material: the pull is to the mean of all."""
+    model, splats = ready(solution=solution, materials=1, material_weight=0.3, materials_from=7)
+    held = ("log_rate", "raw_sun", "raw_share", "raw_wind")
+    for name in held:
         splats[name].requires_grad_().data.copy_(torch.arange(6.0) ** 2)
+    model.on_step(6)
+    assert model.regularisers(splats) == {}
+    model.on_step(7)
     (term,) = model.regularisers(splats).values()
     squares = torch.arange(6.0, dtype=torch.float64) ** 2
-    torch.testing.assert_close(term.double(), 2 * 0.3 * (squares - squares.mean()).square().mean(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(term.double(), 4 * 0.3 * (squares - squares.mean()).square().mean(), rtol=1e-6, atol=0)
     term.backward()
     pull = 0.3 * 2 * (squares - squares.mean()) / 6
-    for name in ("raw_share", "raw_wind"):
+    for name in held:
         torch.testing.assert_close(splats[name].grad.double(), pull, rtol=1e-6, atol=1e-6)
+    assert splats["initial_state"].grad is None
 
 
-def test_a_prior_on_shares_is_absent_where_it_is_off_or_shares_are_none():
-    no_shares = ready(share_prior=0.3, exchange="iso_6946"), ready(share_prior=0.3, sky=None, wind=False)
-    for model, splats in (ready(), *no_shares):
-        assert model.regularisers(splats) == {}
-    model, _ = ready(share_prior=0.3)
+def test_materials_are_absent_where_they_are_off():
+    model, splats = ready()
+    assert model.regularisers(splats) == {} and not any("materials" in name for name in model.state_dict())
+    model, _ = ready(materials=8)
     assert model.regularisers(splats_of(model, 0)) == {}
 
 
 @pytest.mark.parametrize(
     ("options", "follow"),
-    [({"solution": "linear"}, True), ({}, False), ({"share_prior": 0.2}, True)],
+    [({"solution": "linear"}, True), ({}, False)],
 )
 def test_shares_that_few_images_tell_do_not_learn_faster_in_shorter_runs(options, follow):
     model, _ = ready(**options)

@@ -18,7 +18,7 @@ from heatsplat.physics.responses import driver_means, interval_of
 from heatsplat.physics.surfaces import Core, Exposure, Surface, power_excess
 from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
 from heatsplat.physics.walls import u_value
-from heatsplat.same_bits import sigmoid, variance
+from heatsplat.same_bits import sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.balance_options import BalanceOptions
 from heatsplat.thermal.base import (
@@ -34,6 +34,7 @@ from heatsplat.thermal.base import (
 )
 from heatsplat.thermal.clipping import CLIPS, clipped
 from heatsplat.thermal.coordinates import ImageRange
+from heatsplat.thermal.materials import Materials
 from heatsplat.thermal.surface_drivers import drivers_of
 
 SUN_LIMIT = 200.0  # K m²/kW: a black surface at 8 °C that loses heat by its own radiation alone
@@ -50,7 +51,7 @@ LOG_RATES = (math.log(1e-7), math.log(0.1))  # 1/s: time constants from 10 secon
 GIVEN = (NORMALS, SUN_SEEN, SKY_SEEN)
 LEARNED = ("initial_state", "log_rate", "raw_sun", "raw_share", "raw_wind", "inner_rise")
 LEARNED += ("initial_core", "log_core_rate", "log_coupling")
-SHARES = ("raw_share", "raw_wind")
+OF_MATERIALS = ("log_rate", "raw_sun", "raw_share", "raw_wind", "log_core_rate", "log_coupling")  # all of order one
 MARCHED_AT = "marched_at"  # the tensor of parameters at which a Gaussian was marched along the record
 LINEAR_COST, MARCHED_COST = 400, 3000
 
@@ -116,9 +117,11 @@ class EnergyBalance(ThermalModel):
         sky_view: whether it hides sky as well.
         albedo: of the ground, for sunlight that comes back from what is not sky; None: nothing comes back.
         emissivity: assumed for ``attributes``, in (0, 1].
-        share_prior: weight of the variance over the scene of radiation's and of wind's share, before their sigmoids: a
-            normal prior on each Gaussian's about the mean of all, which is better in other weather where the record and the
-            balance are right, and worse where they are not. 0: each is on its own.
+        materials: number of materials that the scene is taken to be made of (``Materials``), or None: every Gaussian is on
+            its own. They hold what images leave open: the logarithm of rates, and sun, shares and coupling before their
+            sigmoids. Better in other weather where the record and the balance are right, and worse where they are not.
+        material_weight: of the squared distance from them in the loss.
+        materials_from: step from which they do; what Gaussians have learned by then tells them.
         clip: how values outside the range are shown; see ``NewtonHarmonic``.
         lr_initial, lr_rate, lr_sun, lr_share, lr_wind, lr_inner: learning rates.
         lr_end: factor on them at the last step, log-linear in between.
@@ -155,7 +158,9 @@ class EnergyBalance(ThermalModel):
         sky_view: bool = False,
         albedo: float | None = None,
         emissivity: float = 0.95,
-        share_prior: float = 0.0,
+        materials: int | None = None,
+        material_weight: float = 0.003,
+        materials_from: int = 0,
         clip: str = "straight_through",
         lr_initial: float = 2.5e-3,
         lr_rate: float = 2e-2,
@@ -167,8 +172,8 @@ class EnergyBalance(ThermalModel):
     ) -> None:
         super().__init__()
         check_option("clip", clip, CLIPS)
-        if share_prior < 0:
-            raise ValueError(f"share_prior must not be negative, got {share_prior}")
+        if not material_weight > 0:
+            raise ValueError(f"material_weight must be above zero, got {material_weight}; materials=null is without")
         self.options = BalanceOptions(
             solution=solution,
             nodes=nodes,
@@ -188,7 +193,9 @@ class EnergyBalance(ThermalModel):
             albedo=albedo,
             emissivity=emissivity,
         )
-        self.share_prior, self.clip = share_prior, clip
+        self.materials = None if materials is None else Materials(materials, len(OF_MATERIALS))
+        self.material_weight, self.materials_from, self.clip = material_weight, materials_from, clip
+        self._step = 0
         self.lr_initial, self.lr_rate, self.lr_sun = lr_initial, lr_rate, lr_sun
         self.lr_share, self.lr_wind, self.lr_inner, self.lr_end = lr_share, lr_wind, lr_inner, lr_end
         self._convection_factor = 1.0  # other than 1 while ``doubts`` asks what convection that is given matters
@@ -257,9 +264,8 @@ class EnergyBalance(ThermalModel):
             tensors["inner_rise"] = tensor(torch.zeros_like(grey), self.lr_inner)
         drivers = self.climate.drivers
         # Few images tell the shares apart, and at a short run's pace they would follow single ones: nothing that the trained
-        # weather shows, and degrees in another. What is linearised needs that freedom to make up for what it leaves out, and a
-        # prior holds them together at any pace.
-        share = partial(tensor, paced=self.options.linear or self.share_prior > 0)
+        # weather shows, and degrees in another. What is linearised needs that freedom to make up for what it leaves out.
+        share = partial(tensor, paced=self.options.linear)
         if self._sunlit:
             tensors["raw_sun"] = tensor(torch.logit(self._first_sun(grey) / self._sun_limit), self.lr_sun)
         if drivers.sky is not None and not self._exchange_given:
@@ -289,11 +295,14 @@ class EnergyBalance(ThermalModel):
     def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
         return self._temperature(splats, Query(ids, time_s=time_s)) + self.reference_k.item()
 
+    def on_step(self, step: int) -> None:
+        self._step = step
+
     def regularisers(self, splats: Splats) -> dict[str, Tensor]:
-        shares = [splats[name] for name in SHARES if name in splats]
-        if self.share_prior == 0 or not shares or len(splats) == 0:
+        if self.materials is None or self._step < self.materials_from or len(splats) == 0:
             return {}
-        return {"share_prior": self.share_prior * sum(map(variance, shares))}
+        told = [splats[name] for name in OF_MATERIALS if name in splats]
+        return {"materials": self.material_weight * self.materials(told)}
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         """Time constant and, as far as they are simulated, heating by the sun, share of radiation and the wind's, how much of
