@@ -30,11 +30,6 @@ def mean(values: Tensor) -> Tensor:
     return total(values) / values.numel()
 
 
-def variance(values: Tensor) -> Tensor:
-    """The mean squared distance of all values from their mean, []."""
-    return mean((values - mean(values.detach())).square())  # whose slope by that mean is 0
-
-
 def everywhere(value: Tensor, like: Tensor) -> Tensor:
     """A number, [] or of one element, in every place of a tensor [...]; its gradient is a ``total``."""
     return _Everywhere.apply(value, like.shape)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from heatsplat.contracts import SceneError
 from heatsplat.thermal.materials import Materials, divided, moved, nearest
 
 CENTRES = np.array([[-9.0, -1.5, -0.5], [-6.0, -1.0, 0.5], [-10.5, 0.5, -1.0], [-8.0, -2.5, -0.2]])
@@ -70,6 +71,7 @@ def test_what_was_found_goes_on_from_a_checkpoint():
     assert torch.equal(first(list(values.unbind(1))), second(list(values.unbind(1))))
 
 
-def test_no_materials_are_refused():
-    with pytest.raises(ValueError, match="materials must be at least 1, or null for none, got 0"):
-        Materials(0, 3)
+@pytest.mark.parametrize("count", [0, 2.5, True])
+def test_what_is_no_number_of_materials_is_refused(count):
+    with pytest.raises(SceneError, match=f"thermal.materials must be a whole number, 1 or more, got {count}"):
+        Materials(count, 3)

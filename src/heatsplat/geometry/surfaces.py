@@ -28,10 +28,11 @@ def plane_axes(points: Tensor, at: Tensor, neighbours: int) -> tuple[Tensor, Ten
     """
     every, squares, _, middles = _principal_axes(points, points, neighbours)
     distances, near = _nearest(points, at, neighbours)
-    across = (at.double()[:, None] - middles[near])[..., None, :] @ every[near][..., 2:]
-    apart = squares[near, 2] / near.shape[1] + across[..., 0, 0].square()
+    normals = every[..., 2][near]
+    across = ((at.double()[:, None] - middles[near]) * normals).sum(-1)
+    apart = squares[near, 2] / near.shape[1] + across.square()
     share = torch.where(apart > 0, apart.min(1, keepdim=True).values / apart, 1.0)
-    normals = share[..., None] * every[near][..., 2]
+    normals = share[..., None] * normals
     axes = torch.linalg.eigh(normals.mT @ normals)[1]  # the last is the one along which most of them lie
     axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]
     return axes, distances.square().mean(1).sqrt()

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from heatsplat.contracts import check_count
 from heatsplat.derivatives import once_differentiable
 from heatsplat.same_bits import total
 
@@ -26,13 +27,12 @@ class Materials(nn.Module):
         numbers: parameters of a Gaussian at most.
 
     Raises:
-        ValueError: the count is not above zero.
+        SceneError: the count is none, or zero.
     """
 
     def __init__(self, count: int, numbers: int) -> None:
         super().__init__()
-        if count < 1:
-            raise ValueError(f"materials must be at least 1, or null for none, got {count}")
+        check_count("thermal.materials", count)
         self.register_buffer("means", torch.full((count, numbers), torch.nan))
 
     def forward(self, columns: Sequence[Tensor]) -> Tensor:
