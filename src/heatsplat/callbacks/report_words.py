@@ -84,6 +84,7 @@ RUN_WORDS: Words = {
     # a budget
     "budget": ("time that was given", ""),
     "asked_s": ("asked for", "s"),
+    "clock": ("by the clock", ""),
     "calibration_s": ("spent on measuring the machine", "s"),
     "train_s": ("spent on training", "s"),
     "off_percent": ("missed by", "percent"),
