@@ -40,14 +40,17 @@ HEAD = """# Numerical stability in hard cases
 
 This page is generated: `make stability` measures every number, and a test (`tests/benchmarks`) fails if one no longer holds.
 
-Each case compares the formula as printed in a paper with our form. Errors are the maximum over seeded random inputs in the
-stated range, relative to a reference with 120 digits, in float32 and float64, for values and for the gradients from autograd
-("slope"). ∞ stands for NaN or infinity. An empty cell means that the combination does not exist: a form without a gradient,
-or a kernel with one type. Numbers are rounded up to one digit and hold within a factor of ten on any machine. Our form also
-stays below a promised number of machine epsilons ε (1.2e-7 in float32, 2.2e-16 in float64), which the test checks.
+Each case compares the formula as printed in a paper with our form. In every case the printed form loses at least one digit more,
+often all of them, or ends in NaN; ours stays below a promised number of machine epsilons ε (1.2e-7 in float32, 2.2e-16 in
+float64). The test checks both.
+
+Errors are the maximum over seeded random inputs in the stated range, relative to a reference with 120 digits, in float32 and
+float64, for values and for the gradients from autograd ("slope"). ∞ stands for NaN or infinity. An empty cell means that the
+combination does not exist: a form without a gradient, or a kernel with one type. Numbers are rounded up to one digit and hold
+within a factor of ten on any machine.
 
 Tests in `tests/stability` cover renderers, training, step sizes and random inputs. `python src/study.py study=mutations` puts
-unstable forms back one by one and lists the tests that notice (docs/mutations.md).
+unstable forms back one by one and lists the tests that notice ([mutations](mutations.md)).
 """
 
 
