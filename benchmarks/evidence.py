@@ -212,6 +212,7 @@ of training images, along the tracks of scene points and beside a level for each
 pixel. Only effects that are there have one. An error of poses, and what other effects could explain instead, are not in it:
 
 ![verdicts by strength](pictures/{PICTURE})"""
+STRENGTH_AGAIN = "By strength, as above:"
 DRAWN = "drawn_"  # how the names of scenes begin that are drawn at random
 CONDITIONS: dict[str, Callable[[SceneData], bool]] = {
     "indoor": lambda scene: scene.weather is None,
@@ -417,7 +418,8 @@ def written(
             these = [outcome for outcome in outcomes if outcome.size == size and (outcome.seed in unseen) == wanted]
             lines += _confusion(which, these) if these else []
     for name, these in of_numbers.items():
-        lines += _of_drawn(name, these) if these else []
+        note = STRENGTH_AGAIN if STRENGTH_NOTE in lines else STRENGTH_NOTE
+        lines += _of_drawn(name, these, note) if these else []
     return "\n".join(lines) + "\n"
 
 
@@ -450,8 +452,10 @@ def _confusion(which: str, outcomes: Sequence[Outcome]) -> list[str]:
     return [*_by_effect(f"Verdicts compared with the truth, {which}", outcomes), *markdown_table(head, by_scene)]
 
 
-def _of_drawn(name: str, outcomes: Sequence[Outcome]) -> list[str]:
-    """How verdicts and truth agree on scenes drawn at random: one table by effect, one by how they were recorded."""
+def _of_drawn(name: str, outcomes: Sequence[Outcome], note: str) -> list[str]:
+    """How verdicts and truth agree on scenes drawn at random: one table by effect, one by how they were recorded, and below the
+    ``note`` one by strength.
+    """
     numbers = sorted(outcome.seed for outcome in outcomes)
     title = f"Verdicts compared with the truth, scenes drawn at random, {name} ({DRAWN}{numbers[0]} to {DRAWN}{numbers[-1]})"
     rows = []
@@ -464,7 +468,7 @@ def _of_drawn(name: str, outcomes: Sequence[Outcome]) -> list[str]:
     reached = "is reached" if right >= LEAST_RIGHT and wrong <= MOST_WRONG else "is not reached"
     goal = f"The goal of {LEAST_RIGHT:g} % right and at most {MOST_WRONG:g} % wrong {reached}. "
     goal += "Verdicts on effects whose metadata are missing count as right.\n"
-    return [*_by_effect(title, outcomes, goal), *markdown_table(head, rows), *_by_strength(outcomes)]
+    return [*_by_effect(title, outcomes, goal), *markdown_table(head, rows), *_by_strength(outcomes, note)]
 
 
 def groups_by_strength(outcomes: Sequence[Outcome]) -> list[tuple[float, float, int, int, int, int]]:
@@ -482,14 +486,14 @@ def groups_by_strength(outcomes: Sequence[Outcome]) -> list[tuple[float, float, 
     return groups
 
 
-def _by_strength(outcomes: Sequence[Outcome]) -> list[str]:
+def _by_strength(outcomes: Sequence[Outcome], note: str) -> list[str]:
     """How verdicts on effects that are there go with their strength."""
     rows = []
     for low, high, *counts in groups_by_strength(outcomes):
         shares = (f"{100 * count / sum(counts):.0f}" for count in counts)
         rows.append((_between(low, high), sum(counts), *shares))
     head = ("strength", "effects", "found %", "missed %", "undecided, simulated %", "undecided, left out %")
-    return ["", STRENGTH_NOTE, "", *markdown_table(head, rows)] if rows else []
+    return ["", note, "", *markdown_table(head, rows)] if rows else []
 
 
 def _between(low: float, high: float) -> str:
