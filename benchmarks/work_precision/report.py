@@ -97,6 +97,8 @@ def write(
     verdicts = [
         "## Results",
         "",
+        "For each problem the Pareto front, and beside each solver of ours the fastest other one with at most twice its error.",
+        "",
         *(line for name in titles for line in _verdict(rows, name, titles[name])),
         "",
     ]
@@ -106,12 +108,12 @@ def write(
             f"![error against time, frames in order]({where}work_precision.png)", "",
             f"![error against time, each frame by itself]({where}work_precision_alone.png)", "",
         ]  # fmt: skip
-        return "\n".join([*HEAD, "", *stated, "## Pictures", "", *LEGEND, "", *shown, *verdicts, *body]).rstrip() + "\n"
+        return "\n".join([*HEAD, "", "## Pictures", "", *LEGEND, "", *shown, *verdicts, *stated, *body]).rstrip() + "\n"
 
     write_atomically(folder / "table.md", page(""))
     if document is not None:
         write_atomically(document, page("pictures/"))
-    return "\n".join([*stated, *verdicts, *body])
+    return "\n".join([*verdicts, *stated, *body])
 
 
 HEAD = [
@@ -285,13 +287,10 @@ def _verdict(rows: Sequence[Any], name: str, title: str) -> list[str]:
         for own in _chosen(done):
             rivals = [r for r in done if not r.ours and drawn(r) <= EQUAL * drawn(own)]
             rival = min(rivals, key=lambda r: getattr(r, order), default=None)
-            text = "no other solver reaches twice this error within the limits"
+            text = "no other reaches twice this error within the limits"
             if rival is not None:
                 ratio = getattr(rival, order) / getattr(own, order)
-                text = (
-                    f"the fastest other solver with at most twice this error takes {_ratio(ratio)} times as long: "
-                    f"{_point(rival, order)}"
-                )
+                text = f"{_point(rival, order)} takes {_ratio(ratio)} times as long"
             lines.append(f"    - {_point(own, order)}: {text}.")
     return lines
 
