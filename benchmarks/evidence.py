@@ -104,54 +104,49 @@ scenes without AGC, the error on another day is 0.28 to 0.74 of what it is with 
 **Heat sources.** A lamp, a heating or a burner is switched on and off once for all that it warms. Where something drives the
 points, one course of power is fitted to all of them (`physics/common_course.py`); each answers it in three exponentials.
 `method=auto` learns that course and six numbers for each Gaussian if, fitted to three of four images, it predicts the others
-better than K harmonics of each point do; else it takes K harmonics for each Gaussian (ETGS). The fewer the images, the less the
-course bends between them. The course starts at that of the points. So does the extinction of the air, which the joint fit knows
-to a thousandth of its largest at each image, while training alone confuses it with warmer surfaces. `renders/courses.png` shows
-what was learned.
+better than K harmonics of each point do; else K harmonics for each Gaussian (ETGS). The fewer the images, the less the course
+bends between them. Course and extinction of the air start at what the joint fit found: training alone confuses the latter,
+which the fit knows to a thousandth of its largest, with warmer surfaces. `renders/courses.png` shows what was learned.
 
-**A camera before a heat source.** Points move through the image while time goes by, so courses that the joint fit gives them
-may take a camera's pattern for heat. Where all points answer one source, fixed pattern and vignetting are therefore judged
-beside what surfaces can answer to that course (`effects/heat_source.py`), if together they gain 2 dB on held-out observations.
-On `uneven_heated` they gain 5 dB.
+**A camera before a heat source.** Points move through the image while time goes by, so the joint fit may take a camera's
+pattern for heat. Where all points answer one source, fixed pattern and vignetting are therefore judged beside what surfaces can
+answer to its course (`effects/heat_source.py`), if together they gain 2 dB on held-out observations (5 dB on `uneven_heated`).
 
-The source itself is certain if surfaces that answer its course are clearly better predicted than two other explanations:
-surfaces that relax before a camera with its own offset and gain in each image, and surfaces behind air that takes its own share
-from each. If that camera predicts better, it cannot be told. The gain is 1.4 to 4.6 dB on `heated` (tiny, 16 to 31 images), and
--0.1 to -3.1 dB on six random scenes without a lamp whose points seemed to answer one. That the scene changes is certain even
-then, if before that camera and behind such air surfaces that relax are clearly better predicted than constant levels.
+The source itself is certain if surfaces that answer its course are clearly better predicted than surfaces that relax before a
+camera with its own offset and gain in each image, and than surfaces behind air that takes its own share from each; if that
+camera predicts better, it cannot be told. The gain is 1.4 to 4.6 dB on `heated` (tiny, 16 to 31 images), and -0.1 to -3.1 dB on
+six random scenes without a lamp whose points seemed to answer one. That the scene changes is certain even then, if before that
+camera and behind such air surfaces that relax are clearly better predicted than constant levels.
 
 **Heat that flows.** Where nothing drives the points, contrasts between neighbours fade as fast as the levels that they share,
-unless heat flows between them. Levels fade to the temperature that the scene gives its surroundings, which may be off: by a
-tenth of the range, a flow seemed certain on nine of 11 random scenes without one, or certainly absent where there was one.
-Differences between levels need no such temperature, but a flow fades them, too. The verdict is certain only if both agree
+unless heat flows between them. Levels fade to the temperature of the surroundings, which may be given wrong: off by a tenth of
+the range, a flow seemed certain on nine of 11 random scenes without one, or certainly absent where there was one. Differences
+between levels need no such temperature, but a flow fades them, too. The verdict is certain only if both agree
 (`effects/physical/conduction.py`); on 36 random scenes and nine recordings of presets they do wherever it was right. Beside a
 common course, a flow is absent if contrasts answer it at most 1.17 times as fast as levels (0.5 to 1.1 times on 15 recordings
-with a lamp and no flow). If they answer faster, it cannot be told: bodies of two rates do so, too.
+with a lamp and no flow); if faster, it cannot be told, because bodies of two rates do so, too.
 
 **Heat goes on between images.** A camera may jump from image to image; surfaces do not. Heat that would take the place of an
 effect in doubt is absent if one or two courses over time do not predict images that are left out whole, on the line between
-their neighbours in time (`effects/joint/foreseen.py`), although a decay and a swing as large as the error expected of an
-observation, added to the images, would be predicted. On 14 random scenes that change (14 frames or more) courses gain 1.7 to
-7.1 dB; on four still ones at most 0.1 dB. A gain that walks slowly is predicted as heat is (2 to 7 dB on three), and leaves
-heat in doubt.
+their neighbours in time (`effects/joint/foreseen.py`), although they would predict a decay and a swing as large as the error
+expected of an observation. On 14 random scenes that change (14 frames or more) courses gain 1.7 to 7.1 dB; on four still ones
+at most 0.1 dB. A gain that walks slowly is predicted as heat is (2 to 7 dB on three), and leaves heat in doubt.
 
 **Moving heat sources.** Points warmed by a passing hot object each change at their own time and share no course. If the scene
-otherwise cools, such points are counted (`effects/joint/moments.py`) and a source with all harmonics models what warms them. A
-misplaced point, too, shows changes that go on from image to image in a film, but as often colder as warmer: points that change
-one way count against those that change the other. On `moving_source` there are 5.3 times (320x256) and 6.6 to 9.8 times (tiny,
-six recordings) as many as by chance change that way, elsewhere at most 1.9 times (`metals`); counted alike, up to 3.2 times on
-`cooling` in 80 images.
+otherwise cools, such points are counted (`effects/joint/moments.py`), those that change one way against those that change the
+other, as misplaced points change both ways; a source with all harmonics then models what warms them. On `moving_source` there
+are 5.3 times (320x256) and 6.6 to 9.8 times (tiny, six recordings) as many as by chance change that way, elsewhere at most 1.9
+times (`metals`).
 
 ### Emissivity and angle
 
 Surfaces emit less towards their sides: smooth dielectrics only at grazing angles (Schlick's law, the fifth power of 1 - cos θ),
 rough ones earlier (the first power). The joint fit has one falloff for all points
-(`effects/physical/directional_emissivity.py`) and chooses the power. Harmonics of each point also make up for inexact normals,
-and mirrored surroundings follow a falloff a little. Harmonics give way where, at the usual point, the falloff explains four
-fifths of what they explain; likewise where mirrors do, which explain 0.97 to 0.99 of it on four recordings with mirrors
-(`mirrors`, two random rooms). Normals are those of planes through 17 scene points of which those on other surfaces count little
-(`effects/surface.py`): on the planes of three random rooms they are off by 0.6° in the median, and nine of ten by less than 2
-to 10°; planes through nine points were by 1.2° and 15 to 22°.
+(`effects/physical/directional_emissivity.py`) and chooses the power. Harmonics of each point, which also make up for inexact
+normals, give way where, at the usual point, the falloff explains four fifths of what they explain; likewise where mirrors do,
+which explain 0.97 to 0.99 of it on four recordings with mirrors (`mirrors`, two random rooms). Normals are those of planes
+through 17 scene points of which those on other surfaces count little (`effects/surface.py`): on the planes of three random
+rooms they are off by 0.6° in the median, and nine of ten by less than 2 to 10°.
 
 Blur takes contrast of slanted points and passes for a falloff, but its effects from afar and beside edges remain. A falloff is
 therefore certain only if, of the half of the points that it changes most, it explains at the usual one a third of what
