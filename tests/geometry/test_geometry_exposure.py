@@ -5,9 +5,13 @@ import math
 import pytest
 import torch
 
-from heatsplat.geometry.exposure import lit_beside, open_share, sky_directions, sun_directions
+from heatsplat.contracts import Weather
+from heatsplat.datamodules.sun import Site
+from heatsplat.datamodules.sun import sun_directions as sun_at
+from heatsplat.geometry.exposure import felt_directions, lit_beside, open_share, sky_directions, sun_directions
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+DAY_S = 86400.0
 
 
 def test_half_the_hemisphere_is_left_beside_a_wall_without_end():
@@ -29,6 +33,29 @@ def test_directions_of_the_sun_stand_for_all_of_its_way():
     assert apart.max() <= math.radians(1.2501)
     assert 70 < len(ways) < 160  # once for all days
     assert torch.equal(sun_directions(-UP.expand(3, 3), UP), UP[None])  # a polar night
+
+
+def test_of_a_year_the_sun_is_looked_from_finely_where_images_feel_it_and_coarsely_elsewhere():
+    times = torch.arange(0.0, 365 * DAY_S, 1800.0, dtype=torch.float64)
+    sun = torch.from_numpy(sun_at(Site(47.0, 9.0), times.numpy() + 1704067200.0))
+    year = Weather(times, sun=sun)
+
+    def apart(ways, when):
+        risen = sun[when & (sun[:, 2] > 0)]
+        return math.degrees((risen @ ways.T).amax(1).clamp(max=1).acos().max())
+
+    noon = 200.5 * DAY_S
+    week = (times > noon - 7 * DAY_S) & (times <= noon)
+    of_a_day = felt_directions(year, [noon - 3600.0, noon, None])
+    assert apart(of_a_day, week) <= 1.2501 and apart(of_a_day, times >= 0) <= 4.0001
+    assert len(of_a_day) < 0.25 * len(sun_directions(sun, UP))
+    of_all = felt_directions(year, (torch.arange(365) * DAY_S).tolist())
+    assert len(of_all) <= 1024 and apart(of_all, times >= 0) < 3.0
+    short = Weather(times[:300], sun=sun[:300])  # six days, as they are felt by an image at their end
+    assert torch.equal(felt_directions(short, [float(times[299])]), sun_directions(sun[:300], UP))
+    assert torch.equal(felt_directions(short, [None]), sun_directions(sun[:300], UP))
+    night = Weather(times[:1000], sun=torch.where(times[:1000, None] > 9 * DAY_S, -sun[:1000].abs(), sun[:1000]))
+    assert apart(felt_directions(night, [20 * DAY_S]), times < 9 * DAY_S) <= 4.0001  # by images of a polar night
 
 
 def test_a_roof_keeps_the_light_from_above_and_not_from_the_side():

@@ -15,6 +15,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, ViewSet, Weather
+from heatsplat.geometry.exposure import felt_directions, sun_directions
 from heatsplat.physics.units import celsius
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import NORMALS, Query, Seeds
@@ -539,6 +540,21 @@ def test_a_weather_with_far_more_wind_than_training_had_is_warned_of(caplog):
     assert not caplog.text
     model.under(replace(weather(), wind_m_s=4.0 * weather().wind_m_s))
     assert re.search(r"m/s of wind in the mean, and training had [0-9.]+: images did not tell", caplog.text)
+
+
+def test_shadows_of_a_long_record_are_of_the_sun_that_images_feel():
+    day, days = weather(), 120
+    times = torch.arange(days * 48, dtype=torch.float64) * 1800.0 - (days - 1) * 24 * HOUR
+    names = ("air_c", "wind_m_s", "humidity_percent", "irradiance_w_m2", "direct_w_m2", "diffuse_w_m2")
+    angle = 2 * math.pi * times / (24 * HOUR)
+    season = 1.2 * (times / times[0]).clamp(min=0)  # the sun stands lower the longer ago
+    sun = torch.stack((angle.sin(), 0.6 * angle.cos() - season, -angle.cos()), dim=1)
+    series = {name: getattr(day, name)[:48].repeat(days) for name in names}
+    record = Weather(times, sun=torch.nn.functional.normalize(sun, dim=1), **series)
+    model, splats = ready(scene(record), shadows=True)
+    ways = felt_directions(record, (0.0, 6 * HOUR, 12 * HOUR, 18 * HOUR))
+    assert torch.equal(model.sun_ways, ways) and splats["sun_seen"].shape[1] == len(ways)
+    assert len(ways) < 0.5 * len(sun_directions(record.sun, record.up))
 
 
 @pytest.mark.parametrize("solution", ["linear", "corrected"])

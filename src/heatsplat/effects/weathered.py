@@ -16,7 +16,7 @@ from heatsplat.effects import weather_record
 from heatsplat.effects.base import Evidence
 from heatsplat.effects.joint.held_out import CHANCE, FOLDS, WORST, HeldOut, compared, fold_of, would_tell
 from heatsplat.effects.observations import Tracks
-from heatsplat.geometry.exposure import lit_beside, sky_directions, sun_directions
+from heatsplat.geometry.exposure import felt_directions, lit_beside, sky_directions
 from heatsplat.geometry.rotations import reflected
 from heatsplat.physics.responses import semi_infinite_weights
 from heatsplat.physics.sky import emissivity_towards, law_for, optical_depth, sky_temperature_k
@@ -400,7 +400,7 @@ class Weathered:
             weather = self.weather
             beams = self._drivers[0][:, BEAMS:]
             if light == SHADOWS:
-                ways = sun_directions(weather.sun, weather.up)
+                ways = felt_directions(weather, self.times_s.tolist())
                 lit = lit_beside(self.tracks.points, self.around, ways)
                 beams = beams * lit[:, (weather.sun @ ways.T).argmax(1)].T
             else:

@@ -6,25 +6,62 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from heatsplat.contracts import Weather
+
 CELL, BEHIND = 1.5, 4.0  # side of a cell and least distance of what hides a point, in distances between points
 APART = math.radians(1.25)  # of directions of the sun: five minutes of its way
+MOST = 1024  # such directions, each a map before training and a number for every Gaussian; beyond, they lie wider apart
+WIDER = 2.0**0.5
+# Of the sun longer before an image than any but massive bodies remember: a year has 260 directions that far apart, and 2,600 that
+# are APART. Hours without an image near them are only rendered after training.
+PAST_S, PAST_APART = 7 * 86400.0, math.radians(4.0)
 
 
-def sun_directions(sun: Tensor, up: Tensor) -> Tensor:
-    """Directions [D, 3] such that each that the sun [T, 3] has above the horizon [up: 3] is within 1.25 degrees of one; up alone
-    where it never rises."""
+def sun_directions(sun: Tensor, up: Tensor, apart: float = APART, known: Tensor | None = None) -> Tensor:
+    """Directions [D, 3] such that each that the sun [T, 3] has above the horizon [up: 3] is within an angle of one; up alone
+    where it never rises.
+
+    Args:
+        apart: the angle in radians, 1.25 degrees.
+        known: [K, 3] directions that there are already, which come first.
+    """
     risen = sun[sun @ up.to(sun) > 0]
-    found, count = torch.empty_like(risen), 0
+    count = 0 if known is None else len(known)
+    found = torch.cat([risen[:0] if known is None else known, torch.empty_like(risen)])
     for direction in risen:
-        if not count or float((found[:count] @ direction).max()) < math.cos(APART):
+        if not count or float((found[:count] @ direction).max()) < math.cos(apart):
             found[count] = direction
             count += 1
     return found[:count].clone() if count else up.to(sun)[None]
+
+
+def felt_directions(weather: Weather, moments_s: Iterable[float | None]) -> Tensor:
+    """Directions [D, 3] that stand for those of the sun in a record, as far as images at ``moments_s`` feel its shadows.
+
+    Where it stood within a week before an image it is within 1.25 degrees of one of them, or, where that were more than 1024,
+    within the least of 1.8, 2.5, ... degrees that are not; at all other times within 4 degrees. Where no image has a time, all
+    of the record counts as near one.
+    """
+    times, moments = weather.times_s, sorted({moment for moment in moments_s if moment is not None})
+    near = torch.full_like(times, not moments, dtype=torch.bool)
+    for moment in moments:
+        first, last = torch.searchsorted(times, torch.tensor([moment - PAST_S, moment], dtype=times.dtype)).tolist()
+        near[max(first - 1, 0) : last + 1] = True
+    apart = APART
+    found = sun_directions(weather.sun[near], weather.up, apart)
+    while len(found) > MOST and apart < PAST_APART:
+        apart = min(WIDER * apart, PAST_APART)
+        found = sun_directions(weather.sun[near], weather.up, apart)
+    if near.all():
+        return found
+    risen = bool((weather.sun[near] @ weather.up.to(weather.sun) > 0).any())
+    return sun_directions(weather.sun, weather.up, PAST_APART, found if risen else None)
 
 
 def sky_directions(count: int, up: Tensor) -> Tensor:

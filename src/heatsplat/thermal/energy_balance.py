@@ -212,6 +212,7 @@ class EnergyBalance(ThermalModel):
             self.register_buffer("sun_ways", torch.zeros(0, 3, dtype=torch.float64))  # those of SUN_SEEN's columns
         self._weather: Weather | None = None
         self._moments: Tensor | None = None  # of training frames
+        self._felt: list[float | None] = []  # moments of all frames
         self._kept: Kept | None = None
         self._course: tuple[dict[str, Tensor], Course] | None = None
         self.register_load_state_dict_post_hook(_live_on)
@@ -229,6 +230,7 @@ class EnergyBalance(ThermalModel):
                 self.mean_wind.copy_(driver_means(weather.times_s, weather.wind_m_s))
             if self._exchange_given:
                 self.sun_limit.fill_(1000.0 * self._shares()[0] / self._radiation())
+        self._felt = [frame.time_s for frame in scene.frames]
         self._moments = torch.tensor(sorted(set(scene.train.times_s) - {None}), dtype=torch.float64)
         self.under(weather)
         for frame in scene.frames:
@@ -243,7 +245,9 @@ class EnergyBalance(ThermalModel):
         """
         mean_wind = self.mean_wind.item() if self.options.windy else 0.0
         ways = self.sun_ways.cpu() if self.options.shadows and len(self.sun_ways) else None
-        drivers, self.simulated = drivers_of(weather, self.options, self.reference_k.item(), mean_wind, ways)
+        drivers, self.simulated = drivers_of(
+            weather, self.options, self.reference_k.item(), mean_wind, ways, self._felt
+        )
         if self.options.shadows and ways is None:
             self.sun_ways = drivers.ways.to(self.reference_k.device)
         self._weather, self.climate = weather, Climate(drivers, self.options.semi_infinite)

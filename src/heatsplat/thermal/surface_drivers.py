@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneError, Weather
-from heatsplat.geometry.exposure import sun_directions
+from heatsplat.geometry.exposure import felt_directions
 from heatsplat.physics.responses import driver_means
 from heatsplat.physics.sky import law_for, sky_temperature_k
 from heatsplat.physics.surfaces import Drivers, power_excess
@@ -39,7 +40,12 @@ class Contribution(NamedTuple):
 
 
 def drivers_of(
-    weather: Weather, options: BalanceOptions, reference_k: float, mean_wind: float, ways: Tensor | None = None
+    weather: Weather,
+    options: BalanceOptions,
+    reference_k: float,
+    mean_wind: float,
+    ways: Tensor | None = None,
+    moments_s: Sequence[float | None] = (),
 ) -> tuple[Drivers, dict[str, dict[str, Any]]]:
     """What drives surfaces in a weather, and the effects that are simulated with what was left out of them.
 
@@ -48,6 +54,7 @@ def drivers_of(
         reference_k: temperature that drivers count from.
         mean_wind: of the record that the model was trained with in m/s; 0 without wind.
         ways: [D, 3] directions of the sun for which it is known what it reaches; None: those of this weather.
+        moments_s: of images, for which such directions are chosen.
 
     Raises:
         SceneError: the record lacks what an option needs.
@@ -58,7 +65,7 @@ def drivers_of(
         _air(weather, options, reference_k),
         _bodies(options, reference_k),
         light,
-        _surroundings(weather, options, up, ways),
+        _surroundings(weather, options, up, ways, moments_s),
         _sky(weather, options, reference_k, up),
         _wind(weather, options, mean_wind),
         # Last: its air replaces that of the record, for wet surfaces but not for the sky.
@@ -125,7 +132,9 @@ def _sunlight(weather: Weather, options: BalanceOptions) -> Contribution:
     return Contribution({"light": weather.irradiance_w_m2 / 1000.0}, {"solar": solar})
 
 
-def _surroundings(weather: Weather, options: BalanceOptions, up: Tensor | None, ways: Tensor | None) -> Contribution:
+def _surroundings(
+    weather: Weather, options: BalanceOptions, up: Tensor | None, ways: Tensor | None, moments_s: Sequence[float | None]
+) -> Contribution:
     """What comes of the scene's own geometry: shadows, sky that is hidden, light from the ground."""
     if options.surrounded and up is None:
         raise SceneError(
@@ -135,7 +144,7 @@ def _surroundings(weather: Weather, options: BalanceOptions, up: Tensor | None, 
     drivers: dict[str, Any] = {}
     effects: dict[str, dict[str, Any]] = {}
     if options.shadows:
-        drivers["ways"] = sun_directions(weather.sun, up) if ways is None else ways
+        drivers["ways"] = felt_directions(weather, moments_s) if ways is None else ways
         shining = weather.sun[weather.direct_w_m2 > 0]
         cosine = float((shining @ drivers["ways"].T).amax(1).min()) if len(shining) else 1.0
         if cosine < math.cos(math.radians(FAR_DEGREES)):

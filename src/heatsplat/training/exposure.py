@@ -13,7 +13,7 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera, SceneData
 from heatsplat.geometry.coverage import surface_depth
-from heatsplat.geometry.exposure import open_share, sky_directions, sun_directions
+from heatsplat.geometry.exposure import felt_directions, open_share, sky_directions
 from heatsplat.geometry.projection import view_matrix
 from heatsplat.renderers.settings import Renderer
 from heatsplat.thermal.base import SKY_SEEN, SUN_SEEN
@@ -66,7 +66,7 @@ class Exposure:
         self._points, self._shares = discs.shapes[0], {}
         renderer = renderer.seeing_far()
         if SUN_SEEN in names:
-            directions = sun_directions(scene.weather.sun, scene.weather.up)
+            directions = felt_directions(scene.weather, (frame.time_s for frame in scene.frames))
             self._shares[SUN_SEEN] = self.open(scene, renderer, discs, directions)
         if SKY_SEEN in names:
             self._shares[SKY_SEEN] = self.sky(scene, renderer, discs)
