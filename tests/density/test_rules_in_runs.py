@@ -162,6 +162,33 @@ def test_opacities_are_reset_while_they_are_trained(method, more, resets, tmp_pa
     assert steps == resets
 
 
+@pytest.mark.parametrize(
+    ("rule", "more"),
+    [
+        ("budget", ("density.views=2", "density.floor=0", "density.remove_at=[18]")),
+        ("mcmc", ()),
+        ("adaptive", ("density.grad_threshold=1e-9", "density.prune_opacity=0.3")),
+    ],
+)
+def test_no_gaussian_comes_or_goes_while_a_stage_freezes_where_they_lie(rule, more, tmp_path, monkeypatch, caplog):
+    after, ended = [], SplatTraining.on_train_batch_end
+
+    def noted(self, *rest):
+        if self.global_step >= 10:
+            after.append(
+                {name: self.splats[name].detach().clone() for name in ("means", "log_scales", "opacity_logits")}
+            )
+        ended(self, *rest)
+
+    monkeypatch.setattr(SplatTraining, "on_train_batch_end", noted)
+    plan = ("density.start=2", "density.every=4", "density.stop=18", "max_steps=20", "cap_max=1200")
+    run(tmp_path, *BARE, "method=thermalgs", "first_steps=10", f"density={rule}", *plan, *more)
+    assert len(after) == 11 and len(after[0]["means"]) > 600
+    assert all(torch.equal(now[name], after[0][name]) for now in after for name in now)
+    assert "from step 10 on a stage freezes where Gaussians lie" in caplog.text
+    assert "until step 18; give density.stop=10" in caplog.text
+
+
 def test_models_are_told_where_as_many_gaussians_come_as_go(tmp_path, monkeypatch):
     steps, numbers = [], []
     monkeypatch.setattr(Static, "on_rows_changed", lambda self: steps.append(len(numbers)))

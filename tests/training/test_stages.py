@@ -94,6 +94,8 @@ def test_what_is_frozen_until_the_run_ends_tells_from_when():
         "column": Freeze(["opacity_logits[1]"], start=3),
     }
     assert Stages(stretches).held_from("opacity_logits") == 25
+    assert [Stages(stretches).freezes_at("means", step) for step in (9, 24, 25)] == [False, False, True]
+    assert [Stages(stretches).freezes_at("opacity_logits", step) for step in (3, 10, 11)] == [True, False, True]
     assert Stages(stretches, restarts=[20]).held_from("opacity_logits") == Stages({}).held_from("means") == math.inf
 
 

@@ -144,6 +144,13 @@ class SplatTraining(SceneModel):
                     log.warning("no term of loss.terms compares %s images: they are scored, but not learned", name)
             self.loss.check([self.schedule.progress(step) for step in range(self.schedule.steps)])
             self.results.data |= self.loss.prepare(self.scene, self.modality)
+            held, stop = self.stages.held_from("means"), getattr(self.density, "stop", None)
+            if stop is not None and held < min(stop, self.schedule.steps):
+                log.warning(
+                    "from step %d on a stage freezes where Gaussians lie: none comes or goes, though density control would until "
+                    "step %d; give density.stop=%d, so that all of its plan is done before",
+                    held, stop, held,
+                )  # fmt: skip
             self.trainer.val_check_interval = self._between_resets(self.trainer.val_check_interval)
 
     def attach(self, scene: SceneData) -> None:
@@ -288,12 +295,13 @@ class SplatTraining(SceneModel):
         frame = view.frame if camera is view.camera else replace(view.frame, camera=camera)
         self.thermal.on_step(round_step)
         self.cameras.keep_apart()
+        rests = self._density_rests(step)
         signs = self.overlap.signs_at(round_step, len(self.splats) * self.thermal.per_row, self.seed)
         output = self.render(
             frame,
             depth=self.sensor.needs_depth,
-            absgrad=self.density.absgrad_at(round_step),
-            maps=self.density.maps_at(round_step),
+            absgrad=not rests and self.density.absgrad_at(round_step),
+            maps=0 if rests else self.density.maps_at(round_step),
             ratio=ratio,
             signs=signs,
             generator=generator_for(self.seed, step, "rays") if self.thermal.rows == NOTHING else None,
@@ -330,7 +338,8 @@ class SplatTraining(SceneModel):
 
     def on_after_backward(self) -> None:
         output, camera = self._rendered
-        self.density.observe(self._density_state, output, camera, self.schedule.round_step(self.global_step))
+        if not self._density_rests(self.global_step):
+            self.density.observe(self._density_state, output, camera, self.schedule.round_step(self.global_step))
         self._rendered = None
 
     def _updates(self, step: int) -> bool:
@@ -372,8 +381,10 @@ class SplatTraining(SceneModel):
         for name, gone, instead in self.thermal.rows_to_drop(self.splats, round_step):
             cloud.drop(name, gone, instead)
         before, centres = len(self.splats), self.splats.means
-        generator = generator_for(self.seed, step, "density")
-        change = self.density.refine(cloud, round_step, self.scene.extent, generator)
+        change = None
+        if not self._density_rests(step):
+            generator = generator_for(self.seed, step, "density")
+            change = self.density.refine(cloud, round_step, self.scene.extent, generator)
         self._check_change(change, len(self.splats) - before)
         self.density_change = change
         if change is not None and not len(self.splats):
@@ -390,6 +401,11 @@ class SplatTraining(SceneModel):
             for group in cloud.optimizer.param_groups:
                 if group["name"] in self._declared:
                     group |= penalties(self._declared[group["name"]], len(self.splats))
+
+    def _density_rests(self, step: int) -> bool:
+        """Whether a stage freezes where Gaussians lie in ``step``: what density control made of them would lie elsewhere, and
+        never settle."""
+        return self.stages.freezes_at("means", step)
 
     def _check_change(self, change: Any, more: int) -> None:
         """Raises ValueError where density control does not tell what it did: averages and penalties would go on as before."""

@@ -105,6 +105,11 @@ class Stages:
         names = (name for freeze in self.freezes.values() for name in freeze.groups)
         return any(fnmatchcase(group, name) for name in names)
 
+    def freezes_at(self, group: str, step: int) -> bool:
+        """Whether a stage freezes a parameter group, all of it, at ``step``."""
+        names = (name for freeze in self.freezes.values() if freeze.at(step) for name in freeze.groups)
+        return any(fnmatchcase(group, name) for name in names)
+
     def check(self, optimizer: torch.optim.Optimizer) -> None:
         """Warns of stages that freeze nothing, as none of their names is a group of this run."""
         for name, freeze in self.freezes.items():
