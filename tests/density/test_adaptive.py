@@ -183,6 +183,29 @@ def test_fixed_keeps_no_statistic_and_changes_nothing():
     assert len(cloud) == 2
 
 
+@pytest.mark.parametrize(
+    ("moves", "resets"),
+    [
+        ({}, [1000, 2000, 3000]),
+        ({1010: 1.2}, [1000, 2198, 3398]),  # not at 1200, shortly after the first
+        ({1900: 0.5}, [1000, 1950, 2450, 2950, 3450]),
+        ({500: 0.5, 700: 1.3}, [765, 1415, 2065, 2715, 3365]),
+    ],
+)
+def test_resets_of_a_plan_that_is_moved_keep_their_place_in_it(moves, resets):
+    density, found = Adaptive(stop=10_000, reset_every=1000), []
+    for step in range(3500):
+        if step in moves:
+            density.retime(step, moves[step])
+        if 0 < step + 1 == density._last_reset(step):
+            found.append(step + 1)
+            assert not density.settled(step)
+    assert found == resets
+    again = Adaptive(stop=10_000, reset_every=1000)
+    again.load_times(json.loads(json.dumps(density.times())))
+    assert [again._last_reset(step) for step in range(3500)] == [density._last_reset(step) for step in range(3500)]
+
+
 def test_the_rest_of_a_plan_is_moved_and_what_is_past_stays():
     density = Adaptive(start=100, stop=1000, every=100, reset_every=None)
     density.retime(200, 0.5)

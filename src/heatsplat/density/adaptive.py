@@ -13,6 +13,7 @@ from heatsplat.density.ops import Cloud
 from heatsplat.geometry.rotations import quats_to_matrices
 
 SPLIT_SHRINK = 1.6  # scales of the two halves of a split Gaussian (Kerbl et al. 2023)
+ORIGIN = "resets_from"  # of a plan that was moved: the step, not rounded, from which resets are counted
 RECOVERY = 10  # refinements after which opacities have come back from a reset
 
 
@@ -113,11 +114,22 @@ class Adaptive(DensityControl):
         return last <= 0 or step + 1 - last >= RECOVERY * self.every
 
     def _last_reset(self, step: int) -> int:
-        """Steps after which opacities were reset last, up to ``step`` + 1; 0 or less before the first."""
+        """Steps after which opacities were reset last, up to ``step`` + 1; 0 before the first."""
         if self.reset_every is None:
             return 0
         last = min(step + 1, self.stop - 1, self.opacities_until - RECOVERY * self.every)
-        return last // self.reset_every * self.reset_every
+        every, origin = self._times.get("reset_every", self.reset_every), self._times.get(ORIGIN, 0)
+        number = int((last - origin) / every) + 1
+        while number > 0 and (after := math.ceil(origin + number * every)) > last:
+            number -= 1
+        return after if number > 0 else 0
+
+    def retime(self, step: int, factor: float) -> None:
+        """As every plan is moved. Resets go on from where they were between two of them: counted from the first step at another
+        interval, the next could follow the last at once."""
+        origin = self._times.get(ORIGIN, 0)
+        super().retime(step, factor)
+        self.load_times(self._times | {ORIGIN: step + factor * (origin - step)})
 
     def _visible(self, opacities: Tensor) -> Tensor:
         """Which Gaussians [N] of opacities [M, N] need not be pruned as transparent."""

@@ -111,7 +111,8 @@ class DensityControl:
     def load_times(self, times: Mapping[str, Any]) -> None:
         """Goes on with the plan of ``times``."""
         self._times = dict(times)
-        for name, value in times.items():
+        for name in times.keys() & {*self.milestones, *self.intervals}:
+            value = times[name]
             least = self.shortest if name in self.intervals else 0
             setattr(self, name, _rounded(value, least))
 
