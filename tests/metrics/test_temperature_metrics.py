@@ -133,7 +133,3 @@ def test_scorer_of_a_masked_image_with_nan():
     scores = Scorer(RANGE, threshold=0.5)(prediction, target, mask)
     assert all(math.isfinite(value) for name, value in scores.items() if name != "lpips")
     assert scores["counted"] == pytest.approx((40 * 36 - 1) / (48 * 36))
-
-
-def test_infinite_psnr_stays_infinite_in_the_mean():
-    assert mean_of_images([{"psnr": 30.0}, {"psnr": math.inf}], "psnr") == math.inf

@@ -41,7 +41,7 @@ class RunResults:
     """What a run found, on which the callbacks of a run also tell each other what they measured.
 
     A value that cannot be had is null, and ``reasons`` says why under "section.name". JSON has no infinity: an infinite
-    value (the PSNR of identical images) is null too, with the reason "infinite".
+    value is null too, with the reason "infinite".
 
     Args:
         run: what was run: method, scene, seed, steps and the like.

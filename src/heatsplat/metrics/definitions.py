@@ -59,7 +59,7 @@ class Cost:
 
 # Keys that every metrics.json has, in its order: scores of the test views, then costs.
 DEFINITIONS = {
-    "psnr": Definition("PSNR", "dB", 2, True, "data range 1, mean of the images' PSNR"),
+    "psnr": Definition("PSNR", "dB", 2, True, "data range 1, at most 100, mean of the images' PSNR"),
     "ssim": Definition(
         "SSIM", "", 4, True, "Gaussian window 11 x 11, sigma 1.5, C1 0.01², C2 0.03²; windows wholly within image and mask"
     ),

@@ -64,6 +64,6 @@ class Scorer:
 
 
 def mean_of_images(rows: Sequence[Mapping[str, float | None]], name: str) -> float | None:
-    """Mean of a score over the images that have it; infinite if one of them is, None if none has it."""
+    """Mean of a score over the images that have it; None if none has it."""
     values = [row[name] for row in rows if row[name] is not None]
     return math.fsum(values) / len(values) if values else None
