@@ -75,7 +75,9 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
         "rgb_resized": False,
         "rgb_squeezed": False,
     }
-    mask = _both(alpha if options.alpha_mask else None, _mask_of(frame, width, height))
+    own = _mask_of(frame, width, height)
+    found["mask_resized"] = own is not None and own.shape != (height, width)
+    mask = _both(alpha if options.alpha_mask else None, None if own is None else resized_mask(own, width, height))
     keeps_colour = frame.read is None or options.thermal_channels == 3
     if pixels.ndim == 3 and (pixels.dtype.kind == "f" or not keeps_colour):
         pixels = to_grey(pixels)
@@ -120,14 +122,16 @@ def _squeezed(width: int, height: int, of_width: int, of_height: int) -> float:
 
 
 def _mask_of(frame: RawFrame, width: int, height: int) -> np.ndarray | None:
-    """The frame's mask, None where it has none. Raises SceneError where it has another size."""
+    """The frame's mask, None where it has none; it may be that of a photo, of another size. Raises SceneError where it has
+    another shape."""
     if frame.read_mask is None:
         return None
     mask = frame.read_mask()
-    if mask.shape != (height, width):
+    down, across = mask.shape
+    if min(down, across) < 1 or _squeezed(width, height, across, down) > MOST_SQUEEZED:
         raise SceneError(
-            f"mask of {frame.name} is {mask.shape[1]}x{mask.shape[0]} but the image is {width}x{height}; "
-            "masks must have the size of the stored image"
+            f"mask of {frame.name} is {across}x{down} but the image is {width}x{height}, which has another shape; crop the mask "
+            f"to what the image shows, or use no masks: data.masks=null, and no mask_path in transforms.json"
         )
     return mask
 
@@ -268,6 +272,8 @@ def image_notes(prepared: Mapping[int, PreparedImage], downscale: float) -> dict
             "%s have another shape than the thermal ones and are squeezed onto them: crop or rectify them to what the thermal "
             "camera sees, or leave them out (data.rgb)", counted(squeezed, "visible image"),
         )  # fmt: skip
+    if resized_masks := sum(f["mask_resized"] for f in found):
+        notes["masks_resized"] = f"{counted(resized_masks, 'mask')} of another size, resized to the image's"
     if masked := [p.mask for p in prepared.values() if p.mask is not None]:
         share = sum(int((~m).sum()) for m in masked) / sum(p.lens.width * p.lens.height for p in prepared.values())
         notes["masked_fraction"] = share

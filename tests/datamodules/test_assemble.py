@@ -403,8 +403,8 @@ def test_masks_that_are_the_wrong_way_round_are_told(caplog, image):
 
 
 def test_masks_must_fit_the_image():
-    frames = frames_of([grey(i) for i in range(9)], read_mask=[lambda: np.ones((3, 4), bool)] * 9)
-    with pytest.raises(SceneError, match=f"mask of 0...png is 4x3 but the image is {WIDTH}x{HEIGHT}"):
+    frames = frames_of([grey(i) for i in range(9)], read_mask=[lambda: np.ones((3, 3), bool)] * 9)
+    with pytest.raises(SceneError, match=f"mask of 0...png is 3x3 but the image is {WIDTH}x{HEIGHT}"):
         scene_of(None, frames=frames)
 
 

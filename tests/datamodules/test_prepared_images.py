@@ -29,6 +29,16 @@ def test_pixels_without_a_temperature_are_masked_and_filled_beside_the_given_mas
     assert (found.thermal == 20.0).all() and found.found["nan"] == 2
 
 
+def test_a_mask_of_a_larger_photo_leaves_out_every_pixel_that_it_touches():
+    mask = np.ones((15, 20), bool)
+    mask[:5, :5] = False  # of 2.5 pixels a pixel
+    found = prepared(np.zeros((6, 8), np.uint8), mask)
+    assert np.argwhere(~found.mask).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]] and found.found["mask_resized"]
+    assert not prepared(np.zeros((6, 8), np.uint8), np.eye(6, 8) == 0).found["mask_resized"]
+    smaller = np.array([[False, True, True, True], [True] * 4, [True] * 4])
+    assert np.argwhere(~prepared(np.zeros((6, 8), np.uint8), smaller).mask)[:, 0].max() <= 2
+
+
 def test_a_mask_of_another_size_is_refused():
     with pytest.raises(SceneError, match="mask of a.png is 4x6 but the image is 8x6"):
         prepared(np.zeros((6, 8), np.uint8), np.ones((6, 4), bool))
