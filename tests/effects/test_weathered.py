@@ -181,6 +181,21 @@ def test_shadows_are_told_where_they_fall_and_not_where_they_do_not():
         assert not (evidence.told and evidence.statistic > SIGMAS), (name, evidence)
 
 
+def test_a_mirrored_sky_is_told_where_nobody_knows_where_the_sun_stands():
+    """As where times are seconds of a clock that is not known."""
+    _, seen = by_a_wall()
+    directions = torch.randn(POINTS, FRAMES, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    directions[..., 2] = directions[..., 2].abs() + 0.1
+    seen["tracks"].directions = directions / directions.norm(dim=2, keepdim=True)
+    plain = recorded(lit=lambda sun: torch.ones(POINTS), **seen)
+    plain = replace(plain, weather=replace(plain.weather, sun=None, direct_w_m2=None, diffuse_w_m2=None))
+    mirroring = replace(plain, values=plain.values + 0.1 * plain._mirrored)
+    found, none = (around(SimpleNamespace(weathered=one), MIRRORED) for one in (mirroring, plain))
+    assert found.told and found.statistic > SIGMAS, found
+    assert none.told and none.statistic < SIGMAS, none
+    assert not around(SimpleNamespace(weathered=plain), SHADOWS).told
+
+
 def test_points_that_follow_the_weather_are_no_levels_and_need_no_neighbours():
     _, seen = by_a_wall()
     weathered = recorded(lit=lambda sun: torch.ones(POINTS), **seen)

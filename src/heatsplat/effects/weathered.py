@@ -203,10 +203,14 @@ class Weathered:
         return compared(self._whole, self.squares(self._others(name)), self.weights)
 
     def beside(self, name: str) -> HeldOut | None:
-        """What one of SHADOWS, ALBEDO, MIRRORED and SKY_VIEW gains; None where nobody knows from where light comes, or how
-        surfaces face it."""
+        """What one of SHADOWS, ALBEDO, MIRRORED and SKY_VIEW gains; None where nobody knows how surfaces face light or, but for
+        MIRRORED, from where it comes."""
         weather = self.weather
-        known = (self.normals, self.tracks, self.around, weather.sun, weather.direct_w_m2, weather.diffuse_w_m2)
+        known = (self.normals, self.tracks)
+        if (
+            name != MIRRORED
+        ):  # of which no light is asked: a record in seconds, without the sun's direction, tells it as well
+            known += (self.around, weather.sun, weather.direct_w_m2, weather.diffuse_w_m2)
         if any(one is None for one in known):
             return None
         less = (*self.parts, ONE_LIGHT) if name == SKY_VIEW else self.parts
