@@ -186,6 +186,27 @@ def test_moments_that_changed_are_refused(tmp_path):
         check_frames(frames_of(timed(10.0)), timed(12.0))
 
 
+@pytest.mark.parametrize(("moved", "told"), [(1e-9, False), (1e-3, True)])
+def test_of_a_camera_on_a_tripod_the_last_digits_of_its_place_are_no_movement(moved, told, tmp_path):
+    write_scene(tmp_path)
+    scene = scene_in(tmp_path)
+
+    def on_a_tripod(aside):
+        camera = scene.train.frames[0].camera
+        viewmat = camera.viewmat.clone()
+        viewmat[0, 3] += aside * scene.distance
+        frames = [replace(frame, camera=replace(camera, viewmat=viewmat)) for frame in scene.train.frames]
+        return replace(scene, train=ViewSet(frames, lambda i: scene.train[i]))
+
+    before = frames_of(on_a_tripod(0.0))
+    check_frames(before, on_a_tripod(0.0))
+    if told:
+        with pytest.raises(SceneError, match="training frames moved by up to"):
+            check_frames(before, on_a_tripod(moved))
+    else:
+        check_frames(before, on_a_tripod(moved))
+
+
 def test_frames_of_one_name_are_no_others(tmp_path):
     scene = scene_in(write_scene(tmp_path))
     same = replace(scene, train=ViewSet([replace(frame, name="a.png") for frame in scene.train.frames], None))

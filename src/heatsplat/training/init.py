@@ -377,7 +377,7 @@ def _geometry_of_checkpoint(path: Path, scene: SceneData, thermal: ThermalModel)
     geometry = {name: tensors[f"splats.raw.{name}"] for name in GEOMETRY}
     written = stored.get("heatsplat", {})
     frames = written.get("scales", {}).get("frames")
-    movement = None if frames is None else camera_movement(frames, scene.train.frames)
+    movement = None if frames is None else camera_movement(frames, scene.train.frames, scene)
     if movement is not None:
         # Frames of another camera have other places too, by its mounting.
         log.warning(

@@ -19,6 +19,7 @@ from heatsplat.geometry.projection import eyes
 # Below these nothing moved: the last digits of a file, or the pixel counts of a smaller image.
 TURNED = 1e-4  # rad
 MOVED = 1e-4  # distance, in median distances of the training cameras from their middle
+STILL = 1e-2  # of the scene's extent, which that is at least: a camera on a tripod has none
 LENS = 1e-3  # of the image's width or height
 LATER_S = 1e-2
 
@@ -63,12 +64,13 @@ def check_frames(
         )
 
 
-def camera_movement(before: Mapping[str, Any], frames: Iterable[Frame]) -> str | None:
+def camera_movement(before: Mapping[str, Any], frames: Iterable[Frame], scene: SceneData) -> str | None:
     """How far the cameras of those frames moved that a checkpoint tells of, in words; None where they did not.
 
     Args:
         before: what it tells (``frames_of``).
         frames: as they are now; those of other names do not count, and of several of one name the first does.
+        scene: whose they are.
     """
     rows = _rows(before["names"])
     now = {frame.name: frame for frame in reversed([*frames]) if frame.name in rows}
@@ -80,7 +82,7 @@ def camera_movement(before: Mapping[str, Any], frames: Iterable[Frame]) -> str |
     turns = old[:, :3, :3] - new[:, :3, :3]  # its norm is 2 sqrt(2) sin(angle / 2)
     angles = 2 * (turns.norm(dim=(1, 2)) / math.sqrt(8)).clamp(max=1).asin()
     all_centers = eyes(before["viewmats"])
-    spread = (all_centers - all_centers.mean(0)).norm(dim=1).median().clamp_min(1e-9)
+    spread = max(float((all_centers - all_centers.mean(0)).norm(dim=1).median()), STILL * scene.extent)
     elsewhere = (distances > MOVED * spread) | (angles > TURNED)
     if bool(elsewhere.any()):
         return (
@@ -105,7 +107,7 @@ def _changes(before: Mapping[str, Any], scene: SceneData, exactly: bool, numbere
         yield f"{_counted(missing)} less"
     if added := [frame.name for frame in train if frame.name not in known]:
         yield f"{_counted(added)} more"
-    if movement := camera_movement(before, now.values()):
+    if movement := camera_movement(before, now.values(), scene):
         yield movement
     in_both = [(row, now[name]) for name, row in _rows(names).items() if name in now]
     if not in_both:
