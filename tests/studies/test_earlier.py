@@ -46,6 +46,27 @@ def test_a_page_speaks_for_runs_whose_folders_are_gone(tmp_path):
     assert all(set(shown[which]) == {"3dgs", "etgs", "theirs"} for shown in pictures for which in ("renders", "errors"))
 
 
+def test_seconds_of_a_submission_are_those_that_it_tells(tmp_path):
+    """They are of a machine that the runs of the reference say nothing of."""
+    root, first, then = protocol_folder(tmp_path / "root", "cooling"), tmp_path / "first", tmp_path / "then"
+    run_of(first, "3dgs", "cooling", 0, 1.0, seconds=8.0)
+    asked = {"tracks": ["steps"], "note": ""}
+    write_leaderboard(first, board(root, **asked))
+    for method, seconds in (("3dgs", 24.0), ("etgs", 30.0)):
+        run_of(then, method, "cooling", 0, 0.5, seconds=seconds)
+    hand_in(tmp_path / "theirs" / "cooling", -0.25)
+    told = {"method": "theirs", "track": "steps", "scenes": {"cooling": {"seconds": 99}}}
+    (tmp_path / "theirs" / "metrics.json").write_text(json.dumps(told))
+    page, theirs = str(first / "leaderboard.html"), [str(tmp_path / "theirs")]
+    found = standings(then, board(root, **asked, earlier=page, submissions=theirs))
+    assert {one.method: one.cost("seconds") for one in found.entries if one.seeds} == {
+        "3dgs": 8,
+        "etgs": 10,
+        "theirs": 99,
+    }
+    assert "those of submissions are as handed in" in found.note
+
+
 def numbers_of_all(entry):
     """What a table says of an entry but for its seconds, which are scaled."""
     parts = [entry.mean("mae_c", part) for part in sorted(entry.parts)]

@@ -119,7 +119,7 @@ def add_earlier(entries: Mapping[Place, Entry], page: EarlierPage) -> dict[str, 
 
     Machines differ. Where runs of the reference in a track are in the folders and on the page, the seconds of all the folders'
     runs in it are multiplied by what the reference took there over what it took here (geometric mean over scenes). Without such
-    a pair they stay as they are.
+    a pair they stay as they are, and those of submissions always do.
     """
     factors = {}
     for track in dict.fromkeys(track for _, _, track in page.seeds):
@@ -145,5 +145,8 @@ def sentence(factors: Mapping[str, float]) -> str:
     text = "Seeds that later runs lack are those of an earlier page."
     scaled = " and ".join(f"{factor:.2f} (equal {track})" for track, factor in factors.items())
     if scaled:
-        text += f" Seconds of later runs are multiplied by {scaled}, which equalises the times of the reference."
+        text += (
+            f" Seconds of later runs are multiplied by {scaled}, which equalises the times of the reference; those of "
+            "submissions are as handed in."
+        )
     return text

@@ -43,6 +43,7 @@ class Result:
         folder: where it lies.
         command: what it was run with.
         on: the machine and threads that its seconds are of, where they are told.
+        handed_in: whether it is a submission's, whose seconds are of a machine of its own.
     """
 
     seed: int
@@ -51,6 +52,7 @@ class Result:
     folder: Path
     command: str
     on: str = ""
+    handed_in: bool = False
 
 
 @dataclass
@@ -112,9 +114,9 @@ class Entry:
             self.earlier, self.runs = earlier, [run for run in self.runs if run.seed not in earlier.numbers]
 
     def scale_seconds(self, factor: float) -> None:
-        """Makes the seconds of the runs those of another machine."""
+        """Makes the seconds of the runs those of another machine; submissions keep theirs."""
         for k, run in enumerate(self.runs):
-            if run.cost.get("seconds") is not None:
+            if run.cost.get("seconds") is not None and not run.handed_in:
                 self.runs[k] = replace(run, cost={**run.cost, "seconds": run.cost["seconds"] * factor})
 
     def values(self, score: str, part: str | None = None) -> list[float]:
@@ -175,7 +177,7 @@ def standings(folder: Path, board: Board) -> Standings:
             seed = next(n for n in count() if n not in taken) if submission.seed is None else submission.seed
             if seed not in taken:
                 told = (score, score.cost, submission.folder, submission.command, submission.machine)
-                entry.runs.append(Result(seed, *told))
+                entry.runs.append(Result(seed, *told, handed_in=True))
     note = ""
     if board.earlier is not None:
         for place, seeds in board.earlier.seeds.items():
