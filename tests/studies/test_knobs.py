@@ -63,6 +63,12 @@ def test_half_and_twice_of_a_number(value, half, twice):
     assert type(scaled(value, 0.5)) is type(value)
 
 
+def test_numbers_near_one_are_told_apart():
+    """Of four digits 0.9999 has none other next to it but 1, which many settings refuse."""
+    jobs, _ = Knobs(lambda job: {"keep": 0.9999, "odd": 1 - 1e-9}, [0.5, 2]).jobs([[]], nowhere)
+    assert [job[0] for job in jobs[1:]] == ["keep=0.9998", "keep=0.99995", "odd=0.999999998", "odd=0.9999999995"]
+
+
 def test_each_job_of_the_grid_has_its_default_and_its_own_numbers_changed_one_at_a_time():
     plan = Knobs(lambda job: {"a.b": 0.1} if job == ["seed=0"] else {"n": 1, "betas": [0.9, 2.0]}, [0.5, 2])
     jobs, first = plan.jobs([["seed=0"], ["seed=1"]], nowhere)

@@ -26,6 +26,8 @@ DEFAULT = "default"  # name of the row in which nothing is changed
 # Settings that are null where the thermal model has a number of its own, and the attribute that has it.
 OF_THE_MODEL = {"init.opacity": "start_opacity", "optim.averaged": "averaged"}
 
+DIGITS = 4  # of a number in an override and in the name of its row
+
 Number = int | float | list[int | float]
 
 
@@ -134,10 +136,14 @@ def scaled(value: Number, factor: float) -> Number:
 
 
 def spelled(value: Number) -> str:
-    """The number as an override has it, four digits of it."""
+    """The number as an override has it, four digits of it; of one near 1 as many as tell what it lacks to a hundredth."""
     if isinstance(value, list):
         return f"[{','.join(map(spelled, value))}]"
-    return str(value) if isinstance(value, int) else f"{value:.4g}"
+    if isinstance(value, int):
+        return str(value)
+    texts = (f"{value:.{digits}g}" for digits in range(DIGITS, 17))
+    near_one = 0.5 <= value < 1
+    return next((text for text in texts if not near_one or abs(value - float(text)) <= 0.01 * (1 - value)), repr(value))
 
 
 def knob(name: str) -> str:
