@@ -150,6 +150,16 @@ def test_the_network_sees_octaves_that_images_tell():
         assert int(code.ne(0).any(0).sum()) == seen
 
 
+@pytest.mark.parametrize(("collocation", "later"), [("record", 18 * HOUR_S), ("view", 18 * HOUR_S)])
+def test_no_two_moments_that_penalties_ask_for_have_the_same_time(collocation, later):
+    """The code of time repeats after two records of the images, which are of nine hours, and the weather is of 22."""
+    model, _ = make(time="record", collocation=collocation, frames_per_cycle=None)
+    model.train()
+    code, again = (model._moment(moment)[5:] for moment in (HOUR_S, HOUR_S + later))
+    assert torch.equal(code, again) == (collocation == "view")  # which asks for nothing that late
+    assert not torch.equal(model._moment(9 * HOUR_S + 600)[5:], model._moment(9 * HOUR_S)[5:])
+
+
 def test_beyond_the_record_the_clock_stays_and_the_weather_goes_on():
     model, _ = make()
     last, later = 9 * HOUR_S, 15 * HOUR_S

@@ -35,6 +35,7 @@ from heatsplat.thermal.weather_drive import columns_at, remembered, value_at
 log = logging.getLogger(__name__)
 
 LATENT = "latent_heat"
+CODE_PERIOD = 2.0  # of ``octaves``
 # Least and greatest value of each attribute: no surface lies outside, and no head can leave them.
 LIMITS = {
     "emissivity": (0.0, 1.0),
@@ -468,12 +469,27 @@ class EnergyNetwork(ThermalModel):
         weather = torch.where(scale > 0, (self._weather_at(time_s).nan_to_num() - mean) * scale, 0.0)
         parts = [weather]
         if self.options.time != "none":
-            # The balance holds also where a penalty's interval reaches some minutes beyond the last image.
-            clock = self.clock.spans if self.training else self.clock.within
-            share = 2.0 * math.fmod(time_s / DAY_S, 1.0) if self.daily else clock(time_s)
+            share = 2.0 * math.fmod(time_s / DAY_S, 1.0) if self.daily else self._share_of_record(time_s)
             phase = torch.tensor([[share]], dtype=torch.float64)
             parts.append(octaves(phase, self.options.time_frequencies, self.slow_octaves)[0])
         return torch.cat(parts).to(self.network.own.weight)
+
+    def _share_of_record(self, time_s: float) -> float:
+        """What the network sees of a moment as the share of the images' record that has passed.
+
+        The balance holds also where a penalty's interval reaches beyond the images. Where penalties ask for more than two such
+        records, in which the code of time repeats, the clock stays from half a record before and behind the images on: two
+        moments of different weather would be one.
+        """
+        if not self.training:
+            return self.clock.within(time_s)
+        (first_s, last_s), share = self._ends, self.clock.spans(time_s)
+        if self.options.collocation == "view":
+            reach_s = self.options.interval_s[1]
+            first_s = max(first_s, self.clock.first_s - reach_s)
+            last_s = min(last_s, self.clock.first_s + self.clock.span_s + reach_s)
+        whole = self.clock.spans(last_s) - self.clock.spans(first_s)
+        return share if whole < CODE_PERIOD else min(max(share, -0.25 * CODE_PERIOD), 0.75 * CODE_PERIOD)
 
     def _units(self, hidden: Tensor) -> Tensor:
         """Temperatures between T_min (0) and T_max (1), [n]."""
