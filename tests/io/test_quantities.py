@@ -6,6 +6,7 @@ import numpy as np
 from weathered import make_scene
 
 from heatsplat.io.quantities import Clock, clock_of, impossible, moment, words_and_unit
+from heatsplat.thermal.land_cover import ATTRIBUTES
 
 
 def test_the_longest_suffix_is_the_unit():
@@ -14,6 +15,17 @@ def test_the_longest_suffix_is_the_unit():
     assert words_and_unit("heat_loss_w_m2_k") == ("heat loss", "W/(m² K)")
     assert words_and_unit("u_value_w_m2_k") == ("U-value", "W/(m² K)")
     assert words_and_unit("emissivity") == ("emissivity", "")
+    assert words_and_unit("wind_m_s") == ("wind", "m/s") and words_and_unit("height_m") == ("height", "m")
+    assert words_and_unit("heat_capacity_j_m3_k") == ("heat capacity", "J/(m³ K)")
+
+
+def test_what_thermogs_learns_has_units_too():
+    assert [words_and_unit(name) for name in ATTRIBUTES] == [
+        ("emissivity", ""),
+        ("absorptivity", ""),
+        ("convection", "W/(m² K)"),
+        ("heat capacity", "J/(m³ K)"),
+    ]
 
 
 def test_times_are_told_in_the_unit_that_suits_them():

@@ -31,18 +31,29 @@ SUFFIXES = {
     "_k_per_kw_m2": "K m²/kW",
     "_kj_m2_k": "kJ/(m² K)",
     "_j_m2_k_s05": "J/(m² K √s)",
+    "_j_m3_k": "J/(m³ K)",
+    "_j_m2_k": "J/(m² K)",
     "_w_m2_k": "W/(m² K)",
     "_w_m2": "W/m²",
+    "_m_s": "m/s",
+    "_ms": "ms",
+    "_db": "dB",
+    "_mb": "MB",
     "_h": "h",
     "_s": "s",
+    "_m": "m",
     "_k": "K",
     "_c": "°C",
 }
 WRITTEN = {"u_value": "U-value"}  # names that are written otherwise than with spaces
+# Names of ThermoGS, which do not end with their unit.
+WITHOUT_SUFFIX = {"convection": ("convection", "W/(m² K)"), "capacity": ("heat capacity", "J/(m³ K)")}
 
 
 def words_and_unit(name: str) -> tuple[str, str]:
     """Such as ("time constant", "s") of "time_constant_s"; the unit is empty where the name has none."""
+    if name in WITHOUT_SUFFIX:
+        return WITHOUT_SUFFIX[name]
     suffix = next((suffix for suffix in SUFFIXES if name.endswith(suffix)), "")
     bare = name.removesuffix(suffix)
     return WRITTEN.get(bare, bare.replace("_", " ")), SUFFIXES.get(suffix, "")
