@@ -1,5 +1,7 @@
 """CostMeter: what is timed and what is not, memory, and going on after a resume."""
 
+import subprocess
+import sys
 import time
 from dataclasses import replace
 
@@ -9,6 +11,7 @@ import torch
 from fake_run import FakeModule, evaluate, fit, trainer, wall
 from pytorch_lightning.callbacks import ModelCheckpoint
 
+from heatsplat.callbacks import timing
 from heatsplat.callbacks.timing import CLEAR, CostMeter
 
 
@@ -107,6 +110,22 @@ def test_runs_without_timed_steps_say_so(tmp_path):
     assert module.results.cost["train_seconds"] is None
     assert "trained nothing" in module.results.reasons["cost.steps_per_second"]
     assert module.results.cost["gaussians"] == 300
+
+
+def test_a_system_that_tells_no_memory_trains_all_the_same(tmp_path, monkeypatch):
+    """As Windows, which has no module resource."""
+    monkeypatch.setattr(timing, "resource", None)
+    monkeypatch.setattr(timing, "STATUS", tmp_path / "none")
+    module = FakeModule(wall(), tmp_path)
+    fit(module, trainer(tmp_path, [CostMeter(every=2)], steps=6, every=3))
+    content = module.results.as_json()
+    assert content["cost"]["peak_memory_mb"] is None and content["cost"]["train_seconds"] > 0
+    assert "does not tell" in content["reasons"]["cost.peak_memory_mb"]
+    told = subprocess.run(
+        [sys.executable, "-c", "import sys; sys.modules['resource'] = None; import heatsplat.callbacks.timing"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert told.returncode == 0, told.stderr
 
 
 def test_peak_memory_is_that_of_this_run(tmp_path):

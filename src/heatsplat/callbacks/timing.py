@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import statistics
 import sys
 import time
@@ -15,6 +14,11 @@ import torch
 from heatsplat.callbacks.board import add_scalars
 from heatsplat.contracts import check_count
 from heatsplat.metrics.definitions import COSTS
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
 
 OF_EVERY_TEST = {"render_fps", "peak_memory_mb", "gaussians"}  # costs that a test measures, even without training
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
@@ -95,8 +99,11 @@ class CostMeter(pl.Callback):
         self.steps += 1
         if trainer.global_step % self.every == 0:
             self._publish(module)
-            shown = ("train_seconds", "steps_per_second", "peak_memory_mb")
-            add_scalars(module, {f"cost/{name}": module.results.cost[name] for name in shown}, trainer.global_step)
+            shown = {
+                name: module.results.cost[name] for name in ("train_seconds", "steps_per_second", "peak_memory_mb")
+            }
+            known = {f"cost/{name}": value for name, value in shown.items() if value is not None}
+            add_scalars(module, known, trainer.global_step)
 
     def on_validation_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self._since is not None:
@@ -168,7 +175,12 @@ class CostMeter(pl.Callback):
         self._publish_peak(module)
 
     def _publish_peak(self, module: pl.LightningModule) -> None:
-        self.peak_mb = max(self.peak_mb, _peak_mb(module.device))
+        peak = _peak_mb(module.device)
+        if peak is None:
+            why = "this system does not tell how much memory a process took"
+            module.results.put("cost", "peak_memory_mb", None, why)
+            return
+        self.peak_mb = max(self.peak_mb, peak)
         module.results.put("cost", "peak_memory_mb", self.peak_mb)
 
     def _render_seconds(self, module: pl.LightningModule, frames: list) -> list[float]:
@@ -211,13 +223,15 @@ def _reset_peak(device: torch.device) -> None:
         return
 
 
-def _peak_mb(device: torch.device) -> float:
-    """Peak memory in 10^6 bytes: allocated tensors on a GPU, resident memory of the process otherwise."""
+def _peak_mb(device: torch.device) -> float | None:
+    """Peak memory in 10^6 bytes: allocated tensors on a GPU, resident memory of the process otherwise; None where unknown."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 1e6
     try:
         line = next(line for line in STATUS.read_text().splitlines() if line.startswith("VmHWM"))
         return int(line.split()[1]) * 1024 / 1e6
     except (OSError, StopIteration):
+        if resource is None:
+            return None
         # Bytes on macOS, KiB elsewhere; cannot be reset, so a sweep's later runs may show an earlier run's peak.
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
