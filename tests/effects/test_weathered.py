@@ -24,6 +24,7 @@ from heatsplat.effects.weathered import (
     Weathered,
     around,
     judged,
+    water_on,
     weighed,
 )
 from heatsplat.physics.sky import sky_temperature_k
@@ -123,6 +124,18 @@ def test_surfaces_that_rain_wets_are_told_from_those_under_a_roof():
     assert not recorded(rain=showers, without="rain").rained
     assert not recorded(rain=lambda hours: 0.0 * hours).rained
     assert not recorded().rained
+
+
+@pytest.mark.parametrize(
+    ("rained", "bent", "tracks", "wet"),
+    [(True, True, True, True), (False, True, True, False), (True, False, True, False), (True, True, False, False)],
+)
+def test_where_rain_shows_surfaces_transpire_too_in_the_full_balance(monkeypatch, rained, bent, tracks, wet):
+    monkeypatch.setattr("heatsplat.effects.weathered.weather_record.bent", lambda obs: bent)
+    obs = SimpleNamespace(tracks=object() if tracks else None)
+    seen = SimpleNamespace(weathered=SimpleNamespace(rained=rained), obs=obs)
+    assert water_on(seen) == {"rain": FILM_MM if wet else None, "transpires": wet}
+    assert water_on(SimpleNamespace(weathered=None, obs=obs)) == {"rain": None, "transpires": False}
 
 
 def test_a_body_with_a_core_has_two_nodes():

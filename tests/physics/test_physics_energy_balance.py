@@ -12,8 +12,8 @@ from heatsplat.physics import marching
 from heatsplat.physics.energy_balance import Climate
 from heatsplat.physics.marching import stepped_temperature
 from heatsplat.physics.surfaces import Core, Drivers, Surface, power_excess
-from heatsplat.physics.wetness import wet_share, wetted
-from tests.physics.weather_reference import drivers, solved
+from heatsplat.physics.wetness import vapour_k
+from tests.physics.weather_reference import drivers, showers, solved
 
 linear_temperature = Climate.linear_temperature
 MOMENTS = torch.arange(0.0, 172801.0, 7900.0, dtype=torch.float64)
@@ -95,31 +95,48 @@ def test_slow_bodies_lose_nothing_between_samples_a_second_apart():
     torch.testing.assert_close(found.double(), exact, atol=2e-5, rtol=0)
 
 
-def rained_on() -> Climate:
-    """The record with two showers, of which surfaces find another air and find it sooner."""
-    given = drivers()
-    showers = torch.zeros_like(given.times_s)
-    showers[30:34], showers[150:170] = 2.0, 0.5
-    air_k, humidity = given.reference_k + given.air, torch.full_like(given.air, 60.0)
-    air_k, times = wetted(air_k, humidity, wet_share(given.times_s, showers, air_k, humidity, None, 0.3))
-    assert times.max() > 2.5 and (times == 1).any()
-    return Climate(replace(given, air=air_k - given.reference_k, wetted=times))
-
-
 def test_wet_surfaces_are_those_of_a_stiff_solver_and_so_are_their_derivatives():
-    climate, surface, dry = rained_on(), bodies(wind=True), Climate(drivers())
-    truth = solved(climate.drivers, surface, FIRST_DAY)
-    found = course(stepped_temperature, climate, surface)
-    assert (found - truth).abs().max() < 1e-3
-    assert (found - course(stepped_temperature, dry, surface)).abs().max() > 3.0
+    climate, dry = Climate(showers(drivers())), Climate(drivers())
+    surface = bodies(wind=True)._replace(transpires=tensor(0.3, 0.0, 0.6, 1.0))
+    moments = torch.arange(0.0, 86_400.0, 900.0, dtype=torch.float64)
+    truth = solved(climate.drivers, surface, moments)
+    found = marching.march(climate, surface, moments)[..., 0].T
+    # While a film dries within minutes, by how warm the surface was before.
+    off = (found - truth).abs()
+    assert off.max() < 0.4 and off.mean() < 5e-3 and off.median() < 1e-4
+    without = marching.march(dry, surface._replace(transpires=None), moments)[..., 0].T
+    assert (found - without).abs().max() > 5.0
     at = 20_000.0  # between the shower and the sun that dries
-    for name in OWN:
+    for name in (*OWN, "transpires"):
         leaf = getattr(surface, name).clone().requires_grad_()
         stepped_temperature(climate, surface._replace(**{name: leaf}), at).sum().backward()
         up, down = (
             stepped_temperature(climate, surface._replace(**{name: leaf.detach() + step}), at) for step in (1e-4, -1e-4)
         )
         assert ((up - down) / 2e-4 - leaf.grad).abs().max() < 0.05 * leaf.grad.abs().max(), name
+
+
+def test_what_evaporates_nothing_is_as_without_water():
+    """Of no share of transpiration, and of rain that never falls."""
+    surface = bodies(wind=True)
+    given = showers(drivers())
+    dry = course(stepped_temperature, Climate(drivers()), surface)
+    for rain in (None, torch.zeros_like(given.rain)):
+        climate = Climate(replace(given, rain=rain))
+        found = course(stepped_temperature, climate, surface._replace(transpires=like(surface, 0.0)))
+        torch.testing.assert_close(found, dry, atol=1e-9, rtol=0)
+
+
+def test_saturated_vapour_of_the_kernel_is_that_of_the_sky_with_its_derivative():
+    """Surfaces that follow the air at once settle where air - x = L (ρ_sat(x) - ρ_v)."""
+    given = showers(drivers(days=0.25))
+    still = replace(given, rain=None, air=given.air * 0 + 9.0, vapour=given.vapour * 0 + 20.0)
+    count = 4
+    surface = Surface(tensor(-30, 0, 9, 40), tensor(0.1).log().expand(count), None, transpires=tensor(1, 1, 1, 1))
+    x = stepped_temperature(Climate(still), surface, 20_000.0)
+    lacks = vapour_k(still.reference_k + x, torch.tensor(100.0)) - 20.0
+    torch.testing.assert_close(9.0 - x, lacks.clamp(min=0.0), atol=1e-6, rtol=0)
+    assert (x < 8.0).all() and (lacks > 1.0).all()
 
 
 def test_both_agree_where_nothing_is_nonlinear():

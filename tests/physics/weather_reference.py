@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
 from scipy.integrate import odeint
 
+from heatsplat.contracts import Weather
 from heatsplat.physics.sky import sky_temperature_k
 from heatsplat.physics.surfaces import Drivers, Surface, power_excess
+from heatsplat.physics.wetness import COVERS_MM, drying_mm_s_k, vapour_k
 from heatsplat.training.rng import generator_for
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -48,9 +51,17 @@ def drivers(days: float = 2.0, step_s: float = 600.0, wind: bool = True) -> Driv
     )
 
 
+def showers(given: Drivers) -> Drivers:
+    """The record with two showers in air of which the humidity is known."""
+    rain = torch.zeros_like(given.times_s)
+    rain[30:34], rain[150:170] = 2.0 / 3600, 0.5 / 3600
+    vapour = vapour_k(given.reference_k + given.air, torch.full_like(given.air, 60.0))
+    return replace(given, vapour=vapour, rain=rain, dries=drying_mm_s_k(Weather(given.times_s)), holds_mm=0.3)
+
+
 def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch.Tensor | None = None) -> torch.Tensor:
-    """Temperatures x [n, F] of surfaces with normals, and what is behind them, at moments [F] by LSODA, one interval of the
-    record at a time.
+    """Temperatures x [n, F] of surfaces with normals, what is behind them and the water on them, at moments [F] by LSODA, one
+    interval of the record at a time.
 
     Args:
         about: temperatures [n] about which T⁴ and wind are linearised; None solves the full balance.
@@ -70,7 +81,9 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
     if surface.core is not None:
         mu, kappa = surface.core.log_rate.exp().numpy(), surface.core.coupling.numpy()
     anomaly = np.zeros_like(air) if given.wind_anomaly is None else given.wind_anomaly.numpy()
-    wetted = np.ones_like(air) if given.wetted is None else given.wetted.numpy()
+    none = np.zeros_like(air)
+    vapour, rain, dries = (none if s is None else s.numpy() for s in (given.vapour, given.rain, given.dries))
+    transpires = np.zeros(count) if surface.transpires is None else surface.transpires.numpy()
     calm = np.trapezoid(anomaly, times) / (times[-1] - times[0])
     mean = None if about is None else about.numpy()
 
@@ -80,11 +93,11 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
     ends = np.unique(np.concatenate((times, moments.numpy())))
     ends = ends[ends <= moments.max().item()]
     behind = surface.start if surface.core is None else surface.core.start
-    state = np.concatenate((surface.start.numpy(), behind.numpy()))
+    state = np.concatenate((surface.start.numpy(), behind.numpy(), np.zeros(count)))
     found = {ends[0]: state[:count]}
     steep = None if mean is None else (1 + mean / reference) ** 3
     still = None if mean is None else share * (radiated(mean) - steep * mean)
-    jacobian = np.zeros((2 * count, 2 * count))
+    jacobian = np.zeros((3 * count, 3 * count))
     own, across = np.arange(count), np.arange(count, 2 * count)
     jacobian[own, across], jacobian[across, own], jacobian[across, across] = rate * kappa, mu, -mu
     for begin, end in zip(ends[:-1], ends[1:], strict=True):
@@ -95,22 +108,31 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
             return series[k] + (t - times[k]) / span * (series[k + 1] - series[k])
 
         def slope(t, state, now=now):
-            x, y = state[:count], state[count:]
+            x, y, film = state.reshape(3, count)
+            drying = none[:count]
             a, b, f = now(air, t), now(anomaly, t), now(forcing, t) + kappa * (y - x) - leak * x
             if mean is None:
-                taken = f + (1 - share) * (1 + wind * b) * now(wetted, t) * (a - x) - share * radiated(x)
+                evaporated = np.zeros(count)
+                if given.vapour is not None:
+                    wet = np.clip(film / COVERS_MM, 0.0, 1.0)
+                    lacks = vapour_k(torch.from_numpy(x + reference), torch.tensor(100.0)).numpy() - now(vapour, t)
+                    evaporated = (wet + (1 - wet) * np.where(lacks > 0, transpires, 0.0)) * lacks
+                    drying = now(rain, t) - now(dries, t) * np.maximum(lacks, 0.0) * wet
+                    drying = np.where((film >= given.holds_mm) & (drying > 0), 0.0, drying)
+                taken = f + (1 - share) * (1 + wind * b) * (a - x - evaporated) - share * radiated(x)
             else:
                 convected = (1 + wind * calm) * (a - x) + wind * (now(anomaly * air, t) - calm * a - (b - calm) * mean)
                 taken = f + (1 - share) * convected - share * steep * x - still
-            return np.concatenate((rate * taken, mu * (x - y)))
+            return np.concatenate((rate * taken, mu * (x - y), drying))
 
         def slopes(t, state, now=now):
             gusts, about_x = (now(anomaly, t), state[:count]) if mean is None else (calm, mean)
-            exchange = (1 - share) * (1 + wind * gusts) * now(wetted, t) + share * (1 + about_x / reference) ** 3
+            exchange = (1 - share) * (1 + wind * gusts) + share * (1 + about_x / reference) ** 3
             jacobian[own, own] = -rate * (exchange + kappa + leak)
             return jacobian
 
-        options = {"tfirst": True, "Dfun": slopes, "rtol": 1e-8, "atol": 1e-8, "mxstep": 100_000}
+        options = {"tfirst": True, "rtol": 1e-8, "atol": 1e-8, "mxstep": 100_000}
+        options |= {"Dfun": slopes} if given.vapour is None else {"hmax": 60.0, "rtol": 1e-7}
         state = odeint(slope, state, (begin, end), **options)[-1]
         found[end] = state[:count]
     return torch.tensor(np.stack([found[t] for t in moments.numpy()], axis=1))

@@ -38,7 +38,7 @@ from heatsplat.thermal.energy_balance import EnergyBalance
         ({"clouds": True, "sky": None}, "clouds are of the sky: give sky=auto"),
         ({"rain": 0.0}, "rain must be above 0 mm, or null for surfaces that stay dry, got 0.0"),
         ({"rain": 0.3, "solution": "linear"}, "give solution=corrected and indoor_c=null, or rain=null"),
-        ({"rain": 0.3, "inner": True, "indoor_c": 20.0}, "mean losses of walls leave it out"),
+        ({"rain": 0.3, "inner": True, "indoor_c": 20.0}, "mean losses of walls leave them out"),
         ({"emissivity": 0.0}, r"emissivity must lie in \(0, 1\], got 0.0"),
     ],
 )

@@ -205,13 +205,33 @@ def test_rain_cools_surfaces_until_it_has_evaporated_and_a_dry_record_has_no_tra
     model, splats = ready(scene(replace(record, rain_mm_h=2.0 * shower)), rain=0.3)
     dry, _ = ready(scene(replace(record, rain_mm_h=0.0 * shower)), rain=0.3)
     splats.double()
-    assert dry.climate.drivers.wetted is None and dry.effects()["convection"]["rain"].startswith("0.0 h wet")
+    assert dry.climate.drivers.rain is None and dry.effects()["convection"]["rain"].startswith("0 mm")
     colder = [dry.temperature(splats, t * HOUR) - model.temperature(splats, t * HOUR) for t in (11, 13, 29)]
     assert torch.equal(colder[0], torch.zeros(6).double()) and (colder[1] > 2.0).all() and (colder[2].abs() < 0.2).all()
     assert splats_of(model).state_dict().keys() == splats_of(dry).state_dict().keys()  # nothing of it is learned
     untold, _ = ready(scene(record), rain=0.3)
-    assert untold.climate.drivers.wetted is None and "rain_mm_h" in untold.effects()["convection"]["left_out_rain"]
+    assert untold.climate.drivers.rain is None and "rain_mm_h" in untold.effects()["convection"]["left_out_rain"]
     assert "surfaces stay dry" in caplog.text
+
+
+def test_transpiration_cools_in_the_sun_is_learned_and_can_be_looked_at():
+    model, splats = ready(scene(weather()), transpires=True)
+    dry, _ = ready(scene(weather()))
+    assert set(splats.names) - set(splats_of(dry).names) == {"raw_transpires"}
+    assert model.effects()["convection"]["transpires"] and "transpires" not in dry.effects()["convection"]
+    splats.double()
+    found = [dry.temperature(splats, 13 * HOUR)]
+    for raw in (-4.0, 0.0, 4.0):
+        with torch.no_grad():
+            splats["raw_transpires"].fill_(raw)
+        share = model.attributes(splats, Query())["transpiration"]
+        torch.testing.assert_close(share, torch.sigmoid(splats["raw_transpires"].detach()))
+        found.append(model.temperature(splats, 13 * HOUR))
+    assert (torch.stack(found).diff(dim=0) < 0).all() and (found[0] - found[-1] > 3.0).all()
+    with torch.no_grad():
+        splats["raw_transpires"].zero_()
+    model.features(splats, Query(time_s=13 * HOUR)).sum().backward()
+    assert (splats["raw_transpires"].grad < 0).all()
 
 
 def test_without_the_suns_direction_all_surfaces_lie_level_and_it_says_so():

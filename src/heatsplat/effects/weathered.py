@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -108,12 +108,15 @@ def around(inspected: Inspection, name: str) -> Evidence:
     return replace(evidence, settings={"clouds": weathered.clouded}) if name == MIRRORED else evidence
 
 
-def rain_on(inspected: Inspection) -> dict[str, float | None]:
-    """What the state of a scene is told of rain: of how many mm surfaces keep, None for none. Only a balance that is solved as it
-    stands knows it."""
+def water_on(inspected: Inspection) -> dict[str, Any]:
+    """What the state of a scene is told of water: how many mm of rain surfaces keep, None for none, and whether they transpire.
+
+    Images of a day do not tell transpiration from a surface that takes less light. Where rain shows, water is there to evaporate,
+    and other days are better foreseen with it. Only a balance that is solved as it stands knows either.
+    """
     weathered, obs = inspected.weathered, inspected.obs
     wet = weathered is not None and obs.tracks is not None and weather_record.bent(obs) and weathered.rained
-    return {"rain": FILM_MM if wet else None}
+    return {"rain": FILM_MM if wet else None, "transpires": wet}
 
 
 def weighed(
@@ -207,9 +210,7 @@ class Weathered:
         MIRRORED, from where it comes."""
         weather = self.weather
         known = (self.normals, self.tracks)
-        if (
-            name != MIRRORED
-        ):  # of which no light is asked: a record in seconds, without the sun's direction, tells it as well
+        if name != MIRRORED:  # which needs no light: a record in seconds, without the sun's direction, tells it as well
             known += (self.around, weather.sun, weather.direct_w_m2, weather.diffuse_w_m2)
         if any(one is None for one in known):
             return None

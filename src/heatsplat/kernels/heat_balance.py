@@ -27,9 +27,16 @@ BEND = 26.0  # of those, where its fourth root doubles; it then changes by 0.15 
 SETTLING = 4.0  # y of an interval beyond STEP from which on they are needed in full
 CALM = 1e-3  # exchange below which its changes do not count
 FORGOTTEN = 1e-20  # share of the start that counts as none
+COVERS_MM = 0.1  # a film of water thinner than this covers part of a surface
+TRACE_MM = 1e-3 * COVERS_MM
+PIECE_S = 120.0  # of an interval, over which a film dries evenly
+LATENT_J_KG, AIR_J_M3_K, VAPOUR_J_KG_K = 2.45e6, 1.2e3, 461.5  # Λ of water, ρ c of air, gas constant of vapour
+# Magnus' formula, 610.94 Pa exp(17.625 c / (c + 243.04)) at c °C, as L ρ_sat.
+ZERO_C, MAGNUS, MAGNUS_C = 273.15, 17.625, 243.04
+SATURATED = 610.94 / VAPOUR_J_KG_K * LATENT_J_KG / AIR_J_M3_K
 
 # Rows of the drivers of ``march``; those of effects that are off are not read.
-AIR, SKY, AROUND, LIGHT, WIND_ANOMALY, BEAM_X, BEAM_Y, BEAM_Z, GROUND, WETTED = range(10)
+AIR, SKY, AROUND, LIGHT, WIND_ANOMALY, BEAM_X, BEAM_Y, BEAM_Z, GROUND, VAPOUR, RAIN, DRIES = range(12)
 START, LOG_RATE = 0, 1  # columns of its parameters that every balance has
 
 
@@ -47,7 +54,8 @@ class Balance:
         grounded: with light that the ground reflects.
         heated: with heat f from within, constant or from a room.
         cored: with a core behind the surface.
-        wetted: with water on it, which hastens its exchange with the air.
+        rained: with water of rain on it until it has evaporated.
+        transpiring: with the share q of a wet surface's evaporation that it has where it is dry.
         sensitive: derivatives come with values.
     """
 
@@ -59,13 +67,19 @@ class Balance:
     grounded: bool
     heated: bool
     cored: bool
-    wetted: bool
+    rained: bool
+    transpiring: bool
     sensitive: bool
 
     @property
     def changing(self) -> bool:
         """Whether the exchange with the air goes with time."""
-        return self.windy or self.wetted
+        return self.windy or self.moist
+
+    @property
+    def moist(self) -> bool:
+        """Whether water evaporates."""
+        return self.rained or self.transpiring
 
     @property
     def share_column(self) -> int:
@@ -93,19 +107,31 @@ class Balance:
         return self.inner_column + self.heated
 
     @property
+    def transpiring_column(self) -> int:
+        """Column of q."""
+        return self.core_column + 3 * self.cored
+
+    @property
+    def film_column(self) -> int:
+        """Column of the water on the surface at the first sample."""
+        return self.transpiring_column + self.transpiring
+
+    @property
     def normal_column(self) -> int:
         """First of the three columns of the unit normal, behind which comes the share of sky in what a surface sees."""
-        return self.core_column + 3 * self.cored
+        return self.film_column + self.rained
 
 
 radiates, sunny = constant("radiates"), constant("sunny")
 windy, oriented, sensitive = constant("windy"), constant("oriented"), constant("sensitive")
 shaded, grounded = constant("shaded"), constant("grounded")
 heated, cored = constant("heated"), constant("cored")
-wetted, changing = constant("wetted"), constant("changing")
+rained, transpiring = constant("rained"), constant("transpiring")
+moist, changing = constant("moist"), constant("changing")
 share_column, sun_column = constant("share_column"), constant("sun_column")
 wind_column, inner_column = constant("wind_column"), constant("inner_column")
-core_column, normal_column = constant("core_column"), constant("normal_column")
+core_column, transpiring_column = constant("core_column"), constant("transpiring_column")
+film_column, normal_column = constant("film_column"), constant("normal_column")
 
 
 @inline
@@ -220,7 +246,8 @@ def weights_of_lanes(y):
 
 
 class Surfaces(NamedTuple):
-    """LANES of them: their parameters, and what follows from them; lanes of zeros for effects that are off."""
+    """LANES of them: their parameters, and what follows from them; lanes of zeros for effects that are off. Numbers alike for
+    all of them are those of the room behind, of the reference, its inverse, and how much water stays on them."""
 
     rate: Any
     share: Any
@@ -234,8 +261,11 @@ class Surfaces(NamedTuple):
     nx: Any
     ny: Any
     nz: Any
+    transpires: Any
     indoors: Any
+    reference: Any
     inverse: Any
+    holds: Any
 
 
 class Sensitivities(NamedTuple):
@@ -250,24 +280,45 @@ class Sensitivities(NamedTuple):
     core: Any
     slower: Any
     coupling: Any
+    transpires: Any
 
 
 class State(NamedTuple):
-    """x and y, the digits of them that were lost, and derivatives."""
+    """x and y, the digits of them that were lost, the water on the surface in mm, and derivatives."""
 
     x: Any
     y: Any
     lost: Any
     lost_y: Any
+    film: Any
     by: Any
 
 
 class Drivers(NamedTuple):
-    """What drives surfaces at a moment, or what changes of it."""
+    """What drives surfaces at a moment, or what changes of it; ``wet`` is the share of a surface that water covers."""
 
     air: Any
     wind: Any
     wet: Any
+    vapour: Any
+    sky: Any
+    sun: Any
+
+
+class Found(NamedTuple):
+    """What drives surfaces as they find it that evaporate water.
+
+    Args:
+        air: T_eq, which they follow by the tangent of evaporation at their temperature.
+        wind, sky, sun: as they are.
+        times: as fast as dry ones they follow it.
+        moist: share of a wet surface's evaporation that they have.
+    """
+
+    air: Any
+    wind: Any
+    times: Any
+    moist: Any
     sky: Any
     sun: Any
 
@@ -369,7 +420,7 @@ def _forgetting(balance, going, now, decay):
 
 
 @inline
-def _loaded(balance, group, parameters, indoors, reference):
+def _loaded(balance, group, parameters, indoors, reference, holds):
     """LANES surfaces, and their state at the first sample; the last lanes of the last group repeat its last surface."""
     body = np.empty((parameters.shape[1], LANES), parameters.dtype)
     for j in range(LANES):
@@ -394,6 +445,11 @@ def _loaded(balance, group, parameters, indoors, reference):
         column = core_column(balance)
         y, coupling = load_vector(body, column), exp(load_vector(body, column + 2))
         slower = exp(load_vector(body, column + 1) - log_rate)
+    transpires, film = nothing, nothing
+    if transpiring(balance):
+        transpires = load_vector(body, transpiring_column(balance))
+    if rained(balance):
+        film = load_vector(body, film_column(balance))
     if oriented(balance):
         column = normal_column(balance)
         nx, ny, nz = load_vector(body, column), load_vector(body, column + 1), load_vector(body, column + 2)
@@ -411,12 +467,15 @@ def _loaded(balance, group, parameters, indoors, reference):
         nx,
         ny,
         nz,
+        transpires,
         indoors,
+        reference,
         1.0 / reference,
+        holds,
     )
     still = nothing, nothing
-    by = Sensitivities((one, nothing), still, still, still, still, still, (nothing, one), still, still)
-    return surfaces, State(x, y, nothing, nothing, by)
+    by = Sensitivities((one, nothing), still, still, still, still, still, (nothing, one), still, still, still)
+    return surfaces, State(x, y, nothing, nothing, film, by)
 
 
 @inline
@@ -435,11 +494,11 @@ def _reached(balance, group, seen, like):
 def _at_sample(balance, surfaces, drivers, lit, slots, k):
     """Drivers at a sample."""
     f = surfaces.sky
-    wind, wet, sky, sun = 0.0, 1.0, f, f
+    wind, vapour, sky, sun = 0.0, 0.0, f, f
     if windy(balance):
         wind = drivers[WIND_ANOMALY, k]
-    if wetted(balance):
-        wet = drivers[WETTED, k]
+    if moist(balance):
+        vapour = drivers[VAPOUR, k]
     if radiates(balance):
         sky = drivers[AROUND, k] + f * (drivers[SKY, k] - drivers[AROUND, k])
     if sunny(balance):
@@ -452,7 +511,40 @@ def _at_sample(balance, surfaces, drivers, lit, slots, k):
             if shaded(balance):
                 beam = beam * load_vector(lit, slots[k])
             sun = sun + beam
-    return Drivers(drivers[AIR, k], wind, wet, sky, sun)
+    return Drivers(drivers[AIR, k], wind, f * 0.0, vapour, sky, sun)
+
+
+@inline
+def _wet(drivers, film):
+    """Drivers of surfaces with that much water on them."""
+    wet = minimum(film * (1.0 / COVERS_MM), 1.0)
+    return Drivers(drivers.air, drivers.wind, wet, drivers.vapour, drivers.sky, drivers.sun)
+
+
+@inline
+def _film(surfaces, film, lacks, lacks_2, drivers, k, share, seconds):
+    """The water in mm after those seconds, a share of the interval from sample k, in which what vapour lacks to saturation on
+    the surface goes from ``lacks`` to ``lacks_2``.
+
+    What falls on a full film runs off.
+    """
+    pieces = max(1, math.ceil(seconds / PIECE_S))
+    step = seconds / pieces
+    for piece in range(pieces):
+        part = (piece + 0.5) / pieces
+        ahead = part * share
+        dries = (drivers[DRIES, k] + ahead * (drivers[DRIES, k + 1] - drivers[DRIES, k])) * step
+        leaves = maximum(lacks + part * (lacks_2 - lacks), 0.0) * dries
+        fallen = film + (drivers[RAIN, k] + ahead * (drivers[RAIN, k + 1] - drivers[RAIN, k])) * step
+        # Water that covers all dries evenly, and less of it in proportion to what there is: by e^-z, near enough.
+        over = maximum(fallen - COVERS_MM, 0.0)
+        z = maximum(leaves - over, 0.0) * (1.0 / COVERS_MM)
+        left = (fallen - over) / (1.0 + z * (1.0 + z * (0.5 + z * (1 / 6)))) + maximum(over - leaves, 0.0)
+        film = minimum(left, surfaces.holds)
+    # A trace is dry once the rain is over; while it rains, what has fallen since the last sample may be no more than that.
+    if drivers[RAIN, k + 1] == 0.0:
+        film = select(film > TRACE_MM, film, 0.0)
+    return film
 
 
 @inline
@@ -462,6 +554,7 @@ def _changes(begin, end, share):
         share * (end.air - begin.air),
         share * (end.wind - begin.wind),
         share * (end.wet - begin.wet),
+        share * (end.vapour - begin.vapour),
         share * (end.sky - begin.sky),
         share * (end.sun - begin.sun),
     )
@@ -474,25 +567,61 @@ def _after(begin, changes, passed):
         begin.air + passed * changes.air,
         begin.wind + passed * changes.wind,
         begin.wet + passed * changes.wet,
+        begin.vapour + passed * changes.vapour,
         begin.sky + passed * changes.sky,
         begin.sun + passed * changes.sun,
     )
 
 
 @inline
-def _hastened(balance, surfaces, wind, wet, exchange):
+def saturated(surfaces, x):
+    """L ρ_sat of R + x in kelvin (Magnus' formula: Alduchov and Eskridge 1996, Eq. 21), and its derivative.
+
+    Colder than -100 °C, where nothing of it is left, and hotter than 150 °C it stays what it is there.
+    """
+    kelvin = minimum(maximum(surfaces.reference + x, ZERO_C - 100.0), ZERO_C + 150.0)
+    inverse = 1.0 / (kelvin - (ZERO_C - MAGNUS_C))
+    vapour = SATURATED * exp(MAGNUS * (1.0 - MAGNUS_C * inverse)) / kelvin
+    return vapour, vapour * (MAGNUS * MAGNUS_C * inverse * inverse - 1.0 / kelvin)
+
+
+@inline
+def _vapour(balance, surfaces, x, water):
+    """``saturated``, where it matters: on surfaces that transpire, and while there is ``water`` on any of them; else zeros."""
+    vapour, steam = x * 0.0, x * 0.0
+    if transpiring(balance) or (rained(balance) and bits(water > 0.0) != 0):
+        vapour, steam = saturated(surfaces, x)
+    return vapour, steam
+
+
+@inline
+def _found(balance, surfaces, drivers, x, vapour, steep):
+    """Drivers as surfaces find them at x, of saturated vapour there and its derivative."""
+    air, times, share = drivers.air, 1.0, 0.0
+    if moist(balance):
+        share = drivers.wet
+        lacks = vapour - drivers.vapour
+        if transpiring(balance):
+            share = share + select(lacks > 0.0, (1.0 - share) * surfaces.transpires, 0.0)
+        times = 1.0 + share * steep
+        air = drivers.air - share * (lacks + steep * (drivers.air - x)) / times
+    return Found(air, drivers.wind, times, share, drivers.sky, drivers.sun)
+
+
+@inline
+def _hastened(balance, surfaces, wind, times, exchange):
     """An exchange with the air, by wind and water."""
     if windy(balance):
         exchange = exchange * (1.0 + surfaces.wind * wind)
-    if wetted(balance):
-        exchange = exchange * wet
+    if moist(balance):
+        exchange = exchange * times
     return exchange
 
 
 @inline
-def _exchange(balance, surfaces, wind, wet):
+def _exchange(balance, surfaces, wind, times):
     """c, with the air."""
-    exchange = _hastened(balance, surfaces, wind, wet, surfaces.share * 0.0 + 1.0)
+    exchange = _hastened(balance, surfaces, wind, times, surfaces.share * 0.0 + 1.0)
     if radiates(balance):
         exchange = (1.0 - surfaces.share) * exchange
     return exchange
@@ -509,10 +638,12 @@ def _stiffness(balance, surfaces, exchange, steep):
 
 
 @inline
-def _pace(balance, surfaces, begin, changes, steep, seconds):
+def _pace(balance, surfaces, begin, end, steep, seconds):
     """How an interval is divided: enough for the fastest that surfaces are in it."""
-    wind_2, wet_2 = begin.wind + changes.wind, begin.wet + changes.wet
-    fastest = _exchange(balance, surfaces, max(begin.wind, wind_2), max(begin.wet, wet_2))
+    times = begin.times
+    if moist(balance):
+        times = maximum(times, end.times)
+    fastest = _exchange(balance, surfaces, max(begin.wind, end.wind), times)
     settled = surfaces.rate * _stiffness(balance, surfaces, fastest, steep) * seconds
     settles = settled > STEP
     substeps = minimum(1.0 + floor(settled * (1.0 / STEP)), SUBSTEPS)
@@ -522,8 +653,8 @@ def _pace(balance, surfaces, begin, changes, steep, seconds):
     if changing(balance) and bits(settles) != 0:
         # Of a body that follows at once, a substep errs by the square of what exchange changes in it: substeps are even
         # in its fourth root, near enough to its logarithm.
-        early = _stiffness(balance, surfaces, _exchange(balance, surfaces, begin.wind, begin.wet), steep)
-        late = _stiffness(balance, surfaces, _exchange(balance, surfaces, wind_2, wet_2), steep)
+        early = _stiffness(balance, surfaces, _exchange(balance, surfaces, begin.wind, begin.times), steep)
+        late = _stiffness(balance, surfaces, _exchange(balance, surfaces, end.wind, end.times), steep)
         root = select(settles, sqrt(sqrt(maximum(early, CALM))), one)
         root_change = select(settles, sqrt(sqrt(maximum(late, CALM))) - root, nothing)
         whole = _powers(root + root_change, root)
@@ -545,7 +676,7 @@ def _passed(balance, pace, substep):
 @inline
 def _side(balance, surfaces, drivers, x, y, w):
     """The balance of surfaces at x, of cores at y, with w of x."""
-    force = _exchange(balance, surfaces, drivers.wind, drivers.wet) * (drivers.air - x)
+    force = _exchange(balance, surfaces, drivers.wind, drivers.times) * (drivers.air - x)
     if sunny(balance):
         force = force + surfaces.absorptance * drivers.sun
     if radiates(balance):
@@ -561,7 +692,7 @@ def _side(balance, surfaces, drivers, x, y, w):
 def _by_share(balance, surfaces, side):
     """Derivative of the balance by p."""
     drivers = side.drivers
-    return drivers.sky - side.w - _hastened(balance, surfaces, drivers.wind, drivers.wet, drivers.air - side.x)
+    return drivers.sky - side.w - _hastened(balance, surfaces, drivers.wind, drivers.times, drivers.air - side.x)
 
 
 @inline
@@ -571,9 +702,16 @@ def _by_wind(balance, surfaces, side):
     gust = drivers.wind * (drivers.air - side.x)
     if radiates(balance):
         gust = (1.0 - surfaces.share) * gust
-    if wetted(balance):
-        gust = gust * drivers.wet
+    if moist(balance):
+        gust = gust * drivers.times
     return gust
+
+
+@inline
+def _by_transpiring(balance, surfaces, drivers, vapour):
+    """Derivative of the balance by q, of saturated vapour on the surface."""
+    exchange = _exchange(balance, surfaces, drivers.wind, 1.0)
+    return (drivers.wet - 1.0) * exchange * maximum(vapour - drivers.vapour, 0.0)
 
 
 @inline
@@ -584,7 +722,7 @@ def _by_inner(surfaces, side):
 
 
 @inline
-def _sensitivities(balance, surfaces, going, by, functions, rh, early, late):
+def _sensitivities(balance, surfaces, going, by, functions, rh, early, late, drying, drying_2):
     """Derivatives after a substep: of the linearised balance, along the trajectory from its beginning to its end.
 
     Decays at the slope of its beginning, which takes 0.2 % from what derivatives are, and no second exponential.
@@ -592,8 +730,8 @@ def _sensitivities(balance, surfaces, going, by, functions, rh, early, late):
     decay, phi, second, _ = functions
     nothing = rh * 0.0
     before, after = (rh * (phi[0] - second[0]), nothing), (rh * second[0], nothing)
-    share, sun, wind, inner, core, slower, coupling = (
-        by.share, by.sun, by.wind, by.inner, by.core, by.slower, by.coupling,
+    share, sun, wind, inner, core, slower, coupling, transpires = (
+        by.share, by.sun, by.wind, by.inner, by.core, by.slower, by.coupling, by.transpires,
     )  # fmt: skip
     if cored(balance):
         before, after = (before[0], rh * (phi[1] - second[1])), (after[0], rh * second[1])
@@ -622,7 +760,9 @@ def _sensitivities(balance, surfaces, going, by, functions, rh, early, late):
         inner = _carried(
             balance, going, inner, decay, before, _by_inner(surfaces, early), after, _by_inner(surfaces, late)
         )
-    return Sensitivities(start, rate, share, sun, wind, inner, core, slower, coupling)
+    if transpiring(balance):
+        transpires = _carried(balance, going, transpires, decay, before, drying, after, drying_2)
+    return Sensitivities(start, rate, share, sun, wind, inner, core, slower, coupling, transpires)
 
 
 @inline
@@ -630,10 +770,15 @@ def _substep(balance, surfaces, state, going, rh, begin, end):
     """The state after a substep between two sets of drivers, of the lanes that are still ``going``."""
     x, y, p = state.x, state.y, surfaces.share
     w, steep = power(x, surfaces.inverse)
-    early = _side(balance, surfaces, begin, x, y, w)
-    force, ahead = early.force, _side(balance, surfaces, end, x, y, w).force
+    vapour, steam = _vapour(balance, surfaces, x, begin.wet + end.wet)
+    first, last = (
+        _found(balance, surfaces, begin, x, vapour, steam),
+        _found(balance, surfaces, end, x, vapour, steam),
+    )
+    early = _side(balance, surfaces, first, x, y, w)
+    force, ahead = early.force, _side(balance, surfaces, last, x, y, w).force
     # Linear part: the slope of w here, and the exchange with the air halfway.
-    c, c_2 = _exchange(balance, surfaces, begin.wind, begin.wet), _exchange(balance, surfaces, end.wind, end.wet)
+    c, c_2 = _exchange(balance, surfaces, first.wind, first.times), _exchange(balance, surfaces, last.wind, last.times)
     slope = _stiffness(balance, surfaces, 0.5 * (c + c_2), steep)
     functions = _functions(balance, slope, rh, surfaces.slower, surfaces.coupling)
     _, phi, second, third = functions
@@ -644,10 +789,16 @@ def _substep(balance, surfaces, state, going, rh, begin, end):
         added_y = rh * (phi[1] * force + second[1] * (ahead - force) + phi[3] * follows)
     if changing(balance) or radiates(balance):
         # What is not linear in time or in x: the products of exchange and air, and of exchange and x, and T⁴.
-        w_d, air_d = power(x + added, surfaces.inverse)[0] - w, end.air - begin.air
+        w_d, air_d = power(x + added, surfaces.inverse)[0] - w, last.air - first.air
         bent = _bent(balance, second[0], third[0], c_2 - c, air_d, added, p, steep, w_d)
         if cored(balance):
             added_y = added_y + rh * _bent(balance, second[1], third[1], c_2 - c, air_d, added, p, steep, w_d)
+        if moist(balance):  # and what evaporates above the tangent
+            more = steam * added - (_vapour(balance, surfaces, x + added, begin.wet + end.wet)[0] - vapour)
+            more = more * (c * first.moist / first.times + c_2 * last.moist / last.times)
+            bent = bent + third[0] * more
+            if cored(balance):
+                added_y = added_y + rh * third[1] * more
         added = added + rh * bent
     # What digits of x do not hold is added with the next substep (Kahan 1965): between samples a second apart a wall
     # changes by less than they show.
@@ -658,15 +809,43 @@ def _substep(balance, surfaces, state, going, rh, begin, end):
         lost_y = select(going, added_y - (new_y - y), lost_y)
     by = state.by
     if sensitive(balance):
-        late = _side(balance, surfaces, end, new, new_y, power(new, surfaces.inverse)[0])
-        by = _sensitivities(balance, surfaces, going, by, functions, rh, early, late)
-    return State(select(going, new, x), select(going, new_y, y), lost, lost_y, by)
+        vapour_2, drying, drying_2 = vapour, vapour, vapour
+        if moist(balance):
+            vapour_2, steam_2 = _vapour(balance, surfaces, new, begin.wet + end.wet)
+            last = _found(balance, surfaces, end, new, vapour_2, steam_2)
+        if transpiring(balance):
+            drying = _by_transpiring(balance, surfaces, begin, vapour)
+            drying_2 = _by_transpiring(balance, surfaces, end, vapour_2)
+        late = _side(balance, surfaces, last, new, new_y, power(new, surfaces.inverse)[0])
+        by = _sensitivities(balance, surfaces, going, by, functions, rh, early, late, drying, drying_2)
+    return State(select(going, new, x), select(going, new_y, y), lost, lost_y, state.film, by)
 
 
 @inline
-def _over_interval(balance, surfaces, state, begin, changes, seconds):
-    """The state after those seconds, in which drivers change linearly."""
-    pace = _pace(balance, surfaces, begin, changes, power(state.x, surfaces.inverse)[1], seconds)
+def _over_interval(balance, surfaces, state, begin, end, drivers, k, share, seconds):
+    """The state after those seconds, that share of the interval from sample k, in which drivers change linearly.
+
+    What water covers is told ahead by how warm surfaces are at the beginning, and at the end by how warm they were.
+    """
+    changes = _changes(begin, end, share)
+    film, water = state.film, state.film
+    if rained(balance):
+        water = film + (drivers[RAIN, k] + drivers[RAIN, k + 1])
+    vapour, steam = _vapour(balance, surfaces, state.x, water)
+    lacks, wet = vapour - begin.vapour, bits(water > 0.0) != 0
+    if rained(balance) and wet:
+        ahead = _film(surfaces, film, lacks, lacks - changes.vapour, drivers, k, share, seconds)
+        begin = _wet(begin, film)
+        changes = _changes(begin, _wet(_after(begin, changes, 1.0), ahead), 1.0)
+    then = _after(begin, changes, 1.0)
+    pace = _pace(
+        balance,
+        surfaces,
+        _found(balance, surfaces, begin, state.x, vapour, steam),
+        _found(balance, surfaces, then, state.x, vapour, steam),
+        power(state.x, surfaces.inverse)[1],
+        seconds,
+    )
     passed, rh = surfaces.rate * 0.0, surfaces.rate * (1.0 / pace.substeps) * seconds
     for substep in range(GUSTS):
         going = pace.substeps > substep
@@ -678,7 +857,10 @@ def _over_interval(balance, surfaces, state, begin, changes, seconds):
         before, after = _after(begin, changes, passed), _after(begin, changes, later)
         state = _substep(balance, surfaces, state, going, rh, before, after)
         passed = later
-    return state
+    if rained(balance) and wet:
+        lacks_2 = saturated(surfaces, state.x)[0] - then.vapour
+        film = _film(surfaces, film, lacks, lacks_2, drivers, k, share, seconds)
+    return State(state.x, state.y, state.lost, state.lost_y, film, state.by)
 
 
 @inline
@@ -701,16 +883,21 @@ def _store(balance, told, state):
             store_vector(told, column, state.by.core[0])
             store_vector(told, column + 1, state.by.slower[0])
             store_vector(told, column + 2, state.by.coupling[0])
-    elif cored(balance):
-        store_vector(told, 1, state.y)
+        if transpiring(balance):
+            store_vector(told, 1 + transpiring_column(balance), state.by.transpires[0])
+    else:
+        if cored(balance):
+            store_vector(told, 1, state.y)
+        if rained(balance):
+            store_vector(told, 1 + cored(balance), state.film)
 
 
 @inline
 def _march_group(
-    group, balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, moments, found
+    group, balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, holds, moments, found
 ):
     """``march`` of LANES Gaussians."""
-    surfaces, state = _loaded(balance, group, parameters, indoors, reference)
+    surfaces, state = _loaded(balance, group, parameters, indoors, reference, holds)
     lit = _reached(balance, group, seen, parameters)
     told = np.empty((found.shape[2], LANES), parameters.dtype)
     k, moment = first, 0
@@ -722,8 +909,8 @@ def _march_group(
         if aside:
             ending = (moments[moment] - times[k]) / interval
         begin = _at_sample(balance, surfaces, drivers, lit, slots, k)
-        changes = _changes(begin, _at_sample(balance, surfaces, drivers, lit, slots, k + 1), ending)
-        then = _over_interval(balance, surfaces, state, begin, changes, interval * ending)
+        end = _at_sample(balance, surfaces, drivers, lit, slots, k + 1)
+        then = _over_interval(balance, surfaces, state, begin, end, drivers, k, ending, interval * ending)
         if aside:
             _store(balance, told, then)
             for j in range(min(LANES, rows.shape[0] - group * LANES)):
@@ -735,12 +922,13 @@ def _march_group(
 
 
 @kernel
-def march(balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, moments, found):
+def march(balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, holds, moments, found):
     """Temperatures at moments under the full balance: T⁴ as it is, wind as it blows.
 
-    dx/dt = r [g G(t) + c(t) (air - x) + p (s(t) - w(x)) + f - max(f i, 0) x + κ (y - x)] and dy/dt = μ (x - y), with w from
-    ``power``, c = (1 - p) (1 + v wind_anomaly) wetted, G = a light + (1 - a) ground + V max(n · beam, 0) and s = a sky +
-    (1 - a) around.
+    dx/dt = r [g G(t) + c(t) (air - x - E) + p (s(t) - w(x)) + f - max(f i, 0) x + κ (y - x)] and dy/dt = μ (x - y), with w from
+    ``power``, c = (1 - p) (1 + v wind_anomaly), G = a light + (1 - a) ground + V max(n · beam, 0) and s = a sky +
+    (1 - a) around. Evaporation is E = m (``saturated``(x) - vapour), with m = u where a share u is wet, and u + (1 - u) q where
+    surfaces transpire; it dries what rain has left (``_film``). Derivatives take u for given.
     Exponential Rosenbrock steps of third order (Hochbruck, Ostermann and Schweitzer 2009, exprb32), each interval in equal
     substeps, as many as the surface is fast. Lanes are Gaussians; what is found of one depends neither on the others nor on
     the other moments.
@@ -749,21 +937,23 @@ def march(balance, first, parameters, seen, slots, rows, times, drivers, referen
         balance: the effects that there are; without an effect its terms are left out, and with a = 1 where surfaces lie
             level.
         first: sample from which they start.
-        parameters: [n, P] x at that sample in kelvin above the reference, log r, then those of ``balance``; float32 or
-            float64, in which all is computed. Neighbours of like rates are quickest.
+        parameters: [n, P] x at that sample in kelvin above the reference, log r, then those of ``balance``, of which water on
+            the surface in mm and the normal are given; float32 or float64, in which all is computed. Neighbours of like rates
+            are quickest.
         seen: [n, D] V, share of the beam that reaches them from D directions; [n, 0] where all of it does.
         slots: [T] int64 direction of the beam at each sample.
         rows: [n] int64 rows of ``found`` that they fill.
         times: [T] float64 samples.
-        drivers: [10, T] float64.
+        drivers: [12, T] float64; vapour in kelvin, rain in mm/s, and what dries a wet surface in mm/(s K).
         reference: R in kelvin.
         indoors: i in 1/K, of 1 over the temperature of the room behind, above the reference; 0 where f is constant.
+        holds: mm of water that stay on surfaces.
         moments: [F] float64, increasing, within the samples from ``first`` on.
-        found: [F, N, 1] filled with x, [F, N, 2] with x and y; or, of a balance that is sensitive, [F, N, 1 + Q] with x and its
-            derivatives by the parameters before the normal.
+        found: [F, N, ...] filled with x, behind it y and then mm of water where there are such; or, of a balance that is
+            sensitive, [F, N, 1 + Q] with x and its derivatives by the parameters that are not given.
     """
     parallel_for(
         _march_group,
         (rows.shape[0] + LANES - 1) // LANES,
-        (balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, moments, found),
+        (balance, first, parameters, seen, slots, rows, times, drivers, reference, indoors, holds, moments, found),
     )

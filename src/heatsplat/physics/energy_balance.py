@@ -31,8 +31,9 @@ looks at the same tables, nothing is stepped.
 A body without an end (massive wall, ground) takes the heat in by its effusivity b = √(k ρ c), and a = (H / b)² in 1/s stands
 in the place of r: it follows the same drivers, through the table of ``responses.SemiInfiniteTable``.
 
-Rain that has wetted a surface multiplies its exchange with the air, (1 - p)(1 + v b), and sets it off against an air as cold as
-the wet bulb (heatsplat.physics.wetness).
+Water evaporates with that exchange: air - x becomes air - x - m (L ρ_sat(x) - L ρ_v), with m the share of a wet surface's
+evaporation. Rain wets surfaces for as long as it takes to evaporate at their own temperature, and plants transpire with a share
+of their own where they are dry (heatsplat.physics.wetness).
 
 A constant heat q from within (a heated room behind a wall) adds f = q / H, in kelvin, to the drivers. Where the temperature ρ
 of that room is known (above the reference), heat comes of it by a constant conductance instead, f (1 - x/ρ) with f what it
@@ -97,7 +98,7 @@ class Climate:
         rows += [zero if drivers.wind_anomaly is None else drivers.wind_anomaly]
         rows += list(torch.zeros(3, len(zero), dtype=torch.float64) if drivers.beams is None else drivers.beams.T)
         rows.append(zero if drivers.ground is None else drivers.ground)
-        rows.append(zero if drivers.wetted is None else drivers.wetted)
+        rows += [zero if series is None else series for series in (drivers.vapour, drivers.rain, drivers.dries)]
         self.rows = torch.stack(rows).contiguous()
         self.slots = torch.zeros(len(zero), dtype=torch.int64)
         if drivers.ways is not None:

@@ -50,6 +50,8 @@ class Surface(NamedTuple):
         core: what lies behind, or None for bodies of one node.
         inner: f in kelvin (at x = 0 where there is a room), or None where nothing is heated from within.
         exposure: what hides sun and sky from surfaces with normals.
+        transpires: q, share in [0, 1] of a wet surface's evaporation that it has where it is dry, or None: it has none.
+        film: mm of water on it at the first sample, or None: it is dry.
     """
 
     start: Tensor
@@ -61,6 +63,8 @@ class Surface(NamedTuple):
     core: Core | None = None
     inner: Tensor | None = None
     exposure: Exposure = Exposure()
+    transpires: Tensor | None = None
+    film: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -80,8 +84,11 @@ class Drivers:
         ground: light that comes back from level ground, or None where it is black.
         ways: [D, 3] directions of the sun for which shadows are known, or None.
         room: ρ of the air behind walls, not 0, or None: heat from within is constant.
-        wetted: how many times as fast wet surfaces exchange heat with the air, which ``air`` then is as they find it
-            (heatsplat.physics.wetness), or None: all is dry. Only the full balance knows it.
+        vapour: L ρ_v of the air in kelvin (heatsplat.physics.wetness), or None: nothing evaporates. Only the full balance
+            knows it, and what follows.
+        rain: mm/s, or None: no rain wets surfaces.
+        dries: what a wet surface evaporates in mm/(s K), where there is rain.
+        holds_mm: of rain that stay on surfaces.
     """
 
     times_s: Tensor
@@ -96,7 +103,10 @@ class Drivers:
     ground: Tensor | None = None
     ways: Tensor | None = None
     room: float | None = None
-    wetted: Tensor | None = None
+    vapour: Tensor | None = None
+    rain: Tensor | None = None
+    dries: Tensor | None = None
+    holds_mm: float = 0.0
 
 
 def power_excess(excess_k: Tensor, reference_k: float) -> Tensor:

@@ -1,8 +1,12 @@
-"""Rain on surfaces under the sky: how wet it leaves them, and the air that a wet surface finds.
+"""Water on surfaces under the sky: how wet rain leaves them, and what evaporation takes.
 
 Water on a surface evaporates as its heat is carried off (Lewis 1922): a flux of sensible heat h (T - T_air) comes with one of
-latent heat h L (ρ_sat(T) - ρ_v), with vapour densities and L = Λ / (ρ c) of air. Over the few kelvin between the air and the
-wet bulb, ρ_sat is a straight line that is exact at both, so that a surface of which a share w is wet exchanges
+latent heat h L (ρ_sat(T) - ρ_v), with vapour densities and L = Λ / (ρ c) of air. A film of water dries by that at the surface's
+own temperature (``march`` in heatsplat.kernels.heat_balance, which has it from ``vapour_k`` and ``drying_mm_s_k``).
+
+Where one exchange has to do for all surfaces, as in fits of many of them, the film dries as one as warm as the air does
+(``wet_share``), and over the few kelvin between the air and the wet bulb ρ_sat is a straight line that is exact at both, so that
+a surface of which a share w is wet exchanges
 
     h (1 + w s) (T_eq - T),    T_eq = T_air - w d / (1 + w s),    d = L (ρ_sat(T_air) - ρ_v),
 
@@ -20,13 +24,12 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Weather
+from heatsplat.kernels.heat_balance import AIR_J_M3_K, COVERS_MM, LATENT_J_KG, VAPOUR_J_KG_K
 from heatsplat.physics.sky import vapour_pressure_hpa
 from heatsplat.physics.units import kelvin
 from heatsplat.physics.walls import CONVECTION
 
-LATENT_J_KG, AIR_J_M3_K, VAPOUR_J_KG_K = 2.45e6, 1.2e3, 461.5  # Λ, ρ c of air, gas constant of vapour
 FILM_MM = 0.3  # that stays on a surface where nobody says otherwise; the rest runs off
-COVERS_MM = 0.1  # a film thinner than this covers part of a surface
 PIECE_S = 60.0  # of a step between samples, over which evaporation is even
 BISECTIONS, COLDEST_K = 40, 60.0  # below the air, from which the wet bulb is sought
 
@@ -35,6 +38,18 @@ def vapour_kg_m3(air_k: Tensor, humidity_percent: Tensor | float = 100.0) -> Ten
     """Density of water vapour in air of a relative humidity, of any shape; of saturated air by default."""
     hpa = vapour_pressure_hpa(air_k, torch.as_tensor(humidity_percent, dtype=air_k.dtype))
     return 100.0 * hpa / (VAPOUR_J_KG_K * air_k)
+
+
+def vapour_k(air_k: Tensor, humidity_percent: Tensor) -> Tensor:
+    """L ρ_v of air of a relative humidity in kelvin, of any shape: what it lacks to that of a wet surface cools the surface."""
+    return LATENT_J_KG / AIR_J_M3_K * vapour_kg_m3(air_k, humidity_percent)
+
+
+def drying_mm_s_k(weather: Weather) -> Tensor:
+    """What a wet surface evaporates in mm/(s K) for each kelvin of L ρ_v that the air lacks, [T], under convection by convention
+    (ISO 6946, annex C)."""
+    wind = torch.zeros_like(weather.times_s) if weather.wind_m_s is None else weather.wind_m_s
+    return (CONVECTION[0] + CONVECTION[1] * wind) / LATENT_J_KG
 
 
 def wet_bulb_k(air_k: Tensor, humidity_percent: Tensor) -> Tensor:

@@ -30,6 +30,7 @@ class BalanceOptions:
     sky: str | None
     clouds: bool
     rain: float | None
+    transpires: bool
     wind: bool
     sun: bool
     semi_infinite: bool
@@ -56,10 +57,10 @@ class BalanceOptions:
             )
         if self.rain is not None and not self.rain > 0:
             raise ValueError(f"rain must be above 0 mm, or null for surfaces that stay dry, got {self.rain}")
-        if self.rain is not None and (self.linear or self.indoor_c is not None):
+        if (self.rain is not None or self.transpires) and (self.linear or self.indoor_c is not None):
             raise ValueError(
-                "rain works only with the full balance, and mean losses of walls leave it out: give solution=corrected and "
-                "indoor_c=null, or rain=null"
+                "rain and transpires work only with the full balance, and mean losses of walls leave them out: give "
+                "solution=corrected and indoor_c=null, or rain=null and transpires=false"
             )
         if self.nodes == 2 and self.semi_infinite:
             raise ValueError("semi_infinite and nodes=2 exclude each other: give nodes=1 or semi_infinite=false")

@@ -42,6 +42,7 @@ SHARE_LIMITS = (0.02, 0.98)  # of radiation in the exchange: where attributes di
 WIND_LIMITS = (0.0, 0.95)  # of wind in convection: in a calm something is left
 START_SHARE, START_WIND = 0.4, 0.4  # e = 0.9 beside 8 W/(m² K), of which a light breeze makes 40 %
 START_TIME_CONSTANT_S = 3600.0
+START_TRANSPIRES = 0.05  # of a wet surface's evaporation: next to none, of what images do not tell
 START_CORE_S = 6 * 3600.0  # time constant of a core, and its coupling beside the surface's exchange: soil, walls
 START_COUPLING = 0.5
 COUPLINGS = (math.log(0.02), math.log(50.0))
@@ -50,8 +51,9 @@ START_ABSORPTIVITY = 0.5  # at most, where the exchange is given: of what images
 LOG_RATES = (math.log(1e-7), math.log(0.1))  # 1/s: time constants from 10 seconds to 4 months
 GIVEN = (NORMALS, SUN_SEEN, SKY_SEEN)
 LEARNED = ("initial_state", "log_rate", "raw_sun", "raw_share", "raw_wind", "inner_rise")
-LEARNED += ("initial_core", "log_core_rate", "log_coupling")
-OF_MATERIALS = ("log_rate", "raw_sun", "raw_share", "raw_wind", "log_core_rate", "log_coupling")  # all of order one
+LEARNED += ("initial_core", "log_core_rate", "log_coupling", "raw_transpires")
+# All of order one.
+OF_MATERIALS = ("log_rate", "raw_sun", "raw_share", "raw_wind", "log_core_rate", "log_coupling", "raw_transpires")
 MARCHED_AT = "marched_at"  # the tensor of parameters at which a Gaussian was marched along the record
 LINEAR_COST, MARCHED_COST = 400, 3000
 
@@ -86,8 +88,9 @@ class EnergyBalance(ThermalModel):
     Tensors, [N] each: "initial_state" in image units; "log_rate", log of 1/s; "raw_sun", logit of α/H by 200 K m²/kW, or of α
     where the exchange is given; "raw_share", logit of e's share of H; "raw_wind", logit of wind's share of convection; with two
     nodes "initial_core" in image units, "log_core_rate", log of 1/s, and "log_coupling", of the conductance to the core over H;
-    with heat from within "inner_rise", q/H in image units. With solution "corrected" a constant, "marched_at" [N, Q], the
-    parameters at which a Gaussian was last marched.
+    with heat from within "inner_rise", q/H in image units; with transpiration "raw_transpires", logit of its share of a wet
+    surface's evaporation. With solution "corrected" a constant, "marched_at" [N, Q], the parameters at which a Gaussian was
+    last marched.
 
     Args:
         solution: "corrected" solves the full balance along the record, for all training frames at once and anew where
@@ -99,6 +102,8 @@ class EnergyBalance(ThermalModel):
         clouds: whether the clouds of the record warm the sky (``Weather.clouds``); laws are of clear skies.
         rain: millimetres of the record's rain that stay on surfaces until they have evaporated (heatsplat.physics.wetness),
             with the full balance; None: rain leaves surfaces dry, as does a weather without rain_mm_h.
+        transpires: whether surfaces that are dry evaporate a share of what wet ones do, as plants and moist soil, each its own;
+            with the full balance, and the humidity of the record.
         wind: whether wind, if recorded, moves convection.
         sun: whether sunlight, if recorded, heats.
         semi_infinite: bodies have no end (with one node and solution "linear").
@@ -146,6 +151,7 @@ class EnergyBalance(ThermalModel):
         sky: str | None = "auto",
         clouds: bool = False,
         rain: float | None = None,
+        transpires: bool = False,
         wind: bool = True,
         sun: bool = True,
         semi_infinite: bool = False,
@@ -180,6 +186,7 @@ class EnergyBalance(ThermalModel):
             sky=sky,
             clouds=clouds,
             rain=rain,
+            transpires=transpires,
             wind=wind,
             sun=sun,
             semi_infinite=semi_infinite,
@@ -264,6 +271,9 @@ class EnergyBalance(ThermalModel):
             tensors["initial_core"] = tensor(grey.clone(), self.lr_initial)
             tensors["log_core_rate"] = tensor(torch.full_like(grey, -math.log(START_CORE_S)), self.lr_rate)
             tensors["log_coupling"] = tensor(torch.full_like(grey, math.log(START_COUPLING)), self.lr_rate)
+        if self.options.transpires:
+            start = torch.full_like(grey, START_TRANSPIRES).logit()
+            tensors["raw_transpires"] = tensor(start, self.lr_share)
         if self.options.inner:
             tensors["inner_rise"] = tensor(torch.zeros_like(grey), self.lr_inner)
         drivers = self.climate.drivers
@@ -328,6 +338,8 @@ class EnergyBalance(ThermalModel):
             values["wind_share"] = surface.wind
         if surface.inner is not None:
             values["inner_rise_k"] = surface.inner
+        if surface.transpires is not None:
+            values["transpiration"] = surface.transpires
         if surface.exposure.sky is not None:
             values["sky_open"] = surface.exposure.sky
         if surface.exposure.sun is not None and query.time_s is not None:
@@ -450,6 +462,7 @@ class EnergyBalance(ThermalModel):
             exposure=Exposure(*(query.rows(splats[n].detach()) if n in splats else None for n in (SUN_SEEN, SKY_SEEN))),
             core=core() if self.options.nodes == 2 else None,
             inner=query.rows(splats["inner_rise"]) * self.range.bounds.span_k if self.options.inner else None,
+            transpires=bounded("raw_transpires", 0.0, 1.0) if self.options.transpires else None,
         )
 
     def _shares(self) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from heatsplat.physics.sky import law_for, sky_temperature_k
 from heatsplat.physics.surfaces import Drivers, power_excess
 from heatsplat.physics.units import celsius, kelvin
 from heatsplat.physics.walls import LEAST_K
-from heatsplat.physics.wetness import rained_on, wetted
+from heatsplat.physics.wetness import drying_mm_s_k, vapour_k
 from heatsplat.thermal.balance_options import BalanceOptions
 from heatsplat.thermal.weather_drive import NO_CLOUDS
 
@@ -68,8 +68,7 @@ def drivers_of(
         _surroundings(weather, options, up, ways, moments_s),
         _sky(weather, options, reference_k, up),
         _wind(weather, options, mean_wind),
-        # Last: its air replaces that of the record, for wet surfaces but not for the sky.
-        _rain(weather, options, reference_k),
+        _water(weather, options),
     )
     drivers: dict[str, Any] = {}
     effects: dict[str, dict[str, Any]] = {}
@@ -216,21 +215,29 @@ def _wind(weather: Weather, options: BalanceOptions, mean_wind: float) -> Contri
     return Contribution({"wind_anomaly": still}, {"convection": told})
 
 
-def _rain(weather: Weather, options: BalanceOptions, reference_k: float) -> Contribution:
-    """The air that surfaces find, and how much sooner wet ones follow it.
+def _water(weather: Weather, options: BalanceOptions) -> Contribution:
+    """Water that evaporates from surfaces: of the record's rain, and of plants.
 
     Another weather, such as a forecast, often has no column of rain.
     """
-    if options.rain is None:
-        return Contribution()
-    wet = rained_on(weather, options.rain)
-    if wet is None:
+    drivers: dict[str, Any] = {}
+    effects: dict[str, Any] = {}
+    humid = weather.humidity_percent is not None
+    if options.transpires:
+        if not humid:
+            raise SceneError(
+                "transpires=true needs humidity_percent, which the weather does not have; add it, or leave transpiration out"
+            )
+        effects["transpires"] = "a share of a wet surface's evaporation for each Gaussian"
+    if options.rain is not None and (weather.rain_mm_h is None or not humid):
         log.warning("the weather has no rain_mm_h with humidity_percent: surfaces stay dry")
-        left_out = "rain, of which the weather has no rain_mm_h, or no humidity_percent"
-        return Contribution(effects={"convection": {"left_out_rain": left_out}})
-    hours = float(driver_means(weather.times_s, wet)) * float(weather.times_s[-1] - weather.times_s[0]) / 3600.0
-    effects = {"convection": {"rain": f"{hours:.1f} h wet, with up to {options.rain:g} mm of water"}}
-    if not bool((wet > 0).any()):
-        return Contribution(effects=effects)
-    air_k, times_as_fast = wetted(kelvin(weather.air_c), weather.humidity_percent, wet)
-    return Contribution({"air": air_k - reference_k, "wetted": times_as_fast}, effects)
+        effects["left_out_rain"] = "rain, of which the weather has no rain_mm_h, or no humidity_percent"
+    elif options.rain is not None:
+        times_s, rain = weather.times_s, weather.rain_mm_h / 3600.0
+        fallen = float(driver_means(times_s, rain)) * float(times_s[-1] - times_s[0])
+        effects["rain"] = f"{fallen:.3g} mm, of which surfaces hold up to {options.rain:g}"
+        if fallen > 0:
+            drivers |= {"rain": rain, "dries": drying_mm_s_k(weather), "holds_mm": options.rain}
+    if drivers or options.transpires:
+        drivers["vapour"] = vapour_k(kelvin(weather.air_c), weather.humidity_percent)
+    return Contribution(drivers, {"convection": effects} if effects else {})

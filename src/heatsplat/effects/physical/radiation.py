@@ -7,7 +7,7 @@ from dataclasses import replace
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.weathered import NO_BALANCE, PART_SIGMAS, judged, rain_on
+from heatsplat.effects.weathered import NO_BALANCE, PART_SIGMAS, judged, water_on
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -20,11 +20,9 @@ def evidence(inspected: Inspection) -> Evidence:
     found = judged(inspected.weathered, "radiation", obs.why or NO_BALANCE)
     if obs.tracks is None:
         return found
-    bent = weather_record.bent(obs)
-    # A balance that is solved about its mean alone has bodies with a core.
-    weathered = inspected.weathered
-    nodes = 1 if bent or weathered is None else weathered.nodes
-    settings = {"solution": "corrected" if bent else "linear", "nodes": nodes} | rain_on(inspected)
+    bent, weathered = weather_record.bent(obs), inspected.weathered
+    nodes = 1 if weathered is None else weathered.nodes
+    settings = {"solution": "corrected" if bent else "linear", "nodes": nodes} | water_on(inspected)
     return replace(found, settings=settings | {"clouds": weathered is not None and weathered.clouded})
 
 

@@ -8,7 +8,7 @@ from heatsplat.effects.inspection import Inspection
 from heatsplat.effects.weathered import CHANCE, MIN_DB, NO_BALANCE, NOTHING_DB, SIGMAS
 
 # Such bodies are solved about their mean, have no core and stay dry: what the evidence on radiation would choose beside them.
-SOLVED = {"solution": "linear", "nodes": 1, "rain": None}
+SOLVED = {"solution": "linear", "nodes": 1, "rain": None, "transpires": False}
 # Standard errors by which a core, which has more numbers, has to do worse: what heat reaches the end of has one, and where that
 # shows no difference a core says as much. Of thick stone 1.6 to 3.1, of layered walls -0.1 to 0.4.
 WORSE = 1.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.weathered import NO_BALANCE, NO_SUN, PART_SIGMAS, judged, rain_on
+from heatsplat.effects.weathered import NO_BALANCE, NO_SUN, PART_SIGMAS, judged, water_on
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -16,7 +16,7 @@ def evidence(inspected: Inspection) -> Evidence:
     if weather.irradiance_w_m2 is None or float(weather.irradiance_w_m2.max()) <= 0:
         return Evidence(None, NO_SUN)
     found = judged(inspected.weathered, "solar", inspected.obs.why or NO_BALANCE)
-    return replace(found, settings=rain_on(inspected))
+    return replace(found, settings=water_on(inspected))
 
 
 EFFECT = Effect(
