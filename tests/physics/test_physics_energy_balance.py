@@ -116,6 +116,16 @@ def test_wet_surfaces_are_those_of_a_stiff_solver_and_so_are_their_derivatives()
         assert ((up - down) / 2e-4 - leaf.grad).abs().max() < 0.05 * leaf.grad.abs().max(), name
 
 
+def test_films_that_dry_in_the_sun_under_hourly_weather_are_those_of_a_stiff_solver():
+    given = showers(drivers(days=1.0, step_s=3600.0))
+    rain = torch.zeros_like(given.times_s)
+    rain[5:7], rain[15:17] = 1.0 / 3600, 2.0 / 3600
+    climate, surface = Climate(replace(given, rain=rain)), bodies(wind=True)
+    moments = torch.arange(0.0, 86_400.0, 900.0, dtype=torch.float64)
+    off = (marching.march(climate, surface, moments)[..., 0].T - solved(climate.drivers, surface, moments)).abs()
+    assert off.mean() < 0.12 and off.flatten().quantile(0.98) < 1.0 and off.max() < 5.0
+
+
 def test_what_evaporates_nothing_is_as_without_water():
     """Of no share of transpiration, and of rain that never falls."""
     surface = bodies(wind=True)

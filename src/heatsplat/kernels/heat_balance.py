@@ -30,6 +30,7 @@ FORGOTTEN = 1e-20  # share of the start that counts as none
 COVERS_MM = 0.1  # a film of water thinner than this covers part of a surface
 TRACE_MM = 1e-3 * COVERS_MM
 PIECE_S = 120.0  # of an interval, over which a film dries evenly
+LONGEST_S = 600.0  # for which what water covers is told ahead; longer intervals are passed in pieces where it rains
 LATENT_J_KG, AIR_J_M3_K, VAPOUR_J_KG_K = 2.45e6, 1.2e3, 461.5  # Λ of water, ρ c of air, gas constant of vapour
 # Magnus' formula, 610.94 Pa exp(17.625 c / (c + 243.04)) at c °C, as L ρ_sat.
 ZERO_C, MAGNUS, MAGNUS_C = 273.15, 17.625, 243.04
@@ -522,9 +523,9 @@ def _wet(drivers, film):
 
 
 @inline
-def _film(surfaces, film, lacks, lacks_2, drivers, k, share, seconds):
-    """The water in mm after those seconds, a share of the interval from sample k, in which what vapour lacks to saturation on
-    the surface goes from ``lacks`` to ``lacks_2``.
+def _film(surfaces, film, lacks, lacks_2, drivers, k, share, share_2, seconds):
+    """The water in mm after those seconds, from one share of the interval from sample k to another, in which what vapour lacks
+    to saturation on the surface goes from ``lacks`` to ``lacks_2``.
 
     What falls on a full film runs off.
     """
@@ -532,7 +533,7 @@ def _film(surfaces, film, lacks, lacks_2, drivers, k, share, seconds):
     step = seconds / pieces
     for piece in range(pieces):
         part = (piece + 0.5) / pieces
-        ahead = part * share
+        ahead = share + part * (share_2 - share)
         dries = (drivers[DRIES, k] + ahead * (drivers[DRIES, k + 1] - drivers[DRIES, k])) * step
         leaves = maximum(lacks + part * (lacks_2 - lacks), 0.0) * dries
         fallen = film + (drivers[RAIN, k] + ahead * (drivers[RAIN, k + 1] - drivers[RAIN, k])) * step
@@ -822,19 +823,18 @@ def _substep(balance, surfaces, state, going, rh, begin, end):
 
 
 @inline
-def _over_interval(balance, surfaces, state, begin, end, drivers, k, share, seconds):
-    """The state after those seconds, that share of the interval from sample k, in which drivers change linearly.
+def _over_piece(balance, surfaces, state, begin, changes, drivers, k, share, share_2, seconds):
+    """The state after those seconds, from one share of the interval from sample k to another, in which drivers change linearly.
 
     What water covers is told ahead by how warm surfaces are at the beginning, and at the end by how warm they were.
     """
-    changes = _changes(begin, end, share)
     film, water = state.film, state.film
     if rained(balance):
         water = film + (drivers[RAIN, k] + drivers[RAIN, k + 1])
     vapour, steam = _vapour(balance, surfaces, state.x, water)
     lacks, wet = vapour - begin.vapour, bits(water > 0.0) != 0
     if rained(balance) and wet:
-        ahead = _film(surfaces, film, lacks, lacks - changes.vapour, drivers, k, share, seconds)
+        ahead = _film(surfaces, film, lacks, lacks - changes.vapour, drivers, k, share, share_2, seconds)
         begin = _wet(begin, film)
         changes = _changes(begin, _wet(_after(begin, changes, 1.0), ahead), 1.0)
     then = _after(begin, changes, 1.0)
@@ -859,8 +859,26 @@ def _over_interval(balance, surfaces, state, begin, end, drivers, k, share, seco
         passed = later
     if rained(balance) and wet:
         lacks_2 = saturated(surfaces, state.x)[0] - then.vapour
-        film = _film(surfaces, film, lacks, lacks_2, drivers, k, share, seconds)
+        film = _film(surfaces, film, lacks, lacks_2, drivers, k, share, share_2, seconds)
     return State(state.x, state.y, state.lost, state.lost_y, film, state.by)
+
+
+@inline
+def _over_interval(balance, surfaces, state, begin, end, drivers, k, share, seconds):
+    """The state after those seconds, that share of the interval from sample k, in which drivers change linearly.
+
+    Pieces are of the record alone: of how wet other lanes are, nothing that is found may depend.
+    """
+    changes = _changes(begin, end, share)
+    if rained(balance):
+        pieces = max(1, math.ceil(seconds / LONGEST_S - 1e-9))
+        for piece in range(pieces):
+            early, late = piece / pieces * share, (piece + 1) / pieces * share
+            now, then = _after(begin, changes, piece / pieces), _changes(begin, end, late - early)
+            state = _over_piece(balance, surfaces, state, now, then, drivers, k, early, late, seconds / pieces)
+    else:
+        state = _over_piece(balance, surfaces, state, begin, changes, drivers, k, 0.0, share, seconds)
+    return state
 
 
 @inline
