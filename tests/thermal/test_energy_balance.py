@@ -207,7 +207,8 @@ def test_rain_cools_surfaces_until_it_has_evaporated_and_a_dry_record_has_no_tra
     splats.double()
     assert dry.climate.drivers.rain is None and dry.effects()["convection"]["rain"].startswith("0 mm")
     colder = [dry.temperature(splats, t * HOUR) - model.temperature(splats, t * HOUR) for t in (11, 13, 29)]
-    assert torch.equal(colder[0], torch.zeros(6).double()) and (colder[1] > 2.0).all() and (colder[2].abs() < 0.2).all()
+    # Where it rains, hours are passed in pieces.
+    assert (colder[0].abs() < 1e-3).all() and (colder[1] > 2.0).all() and (colder[2].abs() < 0.2).all()
     assert splats_of(model).state_dict().keys() == splats_of(dry).state_dict().keys()  # nothing of it is learned
     untold, _ = ready(scene(record), rain=0.3)
     assert untold.climate.drivers.rain is None and "rain_mm_h" in untold.effects()["convection"]["left_out_rain"]
