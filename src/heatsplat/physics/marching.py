@@ -10,9 +10,8 @@ on from the sample before it.
 every ten minutes; 2 mK where a gust of 10 m/s ends a calm between two samples, and up to 30 mK of bodies that follow air within
 a minute and hardly radiate, under gusts three hours apart. Under rain it is 3 to 80 mK in the mean of a day, and up to 5 K for
 the minutes in which a film of water breaks up on sheet metal in the sun. In float32 as in float64, with samples a second apart,
-too. Between
-marches it is of second order in the change of parameters, 1.7 mK (root mean square) at 2 % of all of them and 10 mK at 5 %;
-``Kept`` marches anew what has moved by more than CHANGE.
+too. Between marches it is of second order in the change of parameters, 1.7 mK (root mean square) at 2 % of all of them and 10 mK
+at 5 %, under rain 16 and 56 mK, as derivatives take water for given; ``Kept`` marches anew what has moved by more than CHANGE.
 """
 
 from __future__ import annotations
