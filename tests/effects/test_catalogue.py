@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from weathered import make_weather
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, ThermalRange, View, ViewSet, Weather
 from heatsplat.datamodules.synthetic import Synthetic
-from heatsplat.effects.base import STAGES
+from heatsplat.effects import catalogue
+from heatsplat.effects.base import STAGES, Evidence
 from heatsplat.effects.catalogue import CATALOGUE, decide
 from heatsplat.effects.weather_record import drivers, drives
 
@@ -109,3 +111,15 @@ def test_a_record_of_wind_and_rain_alone_hides_no_cooling():
     verdicts = decide(replace(cooling, weather=windy))
     assert verdicts["relaxation"].on and verdicts["relaxation"].told, verdicts["relaxation"]
     assert not verdicts["harmonic_source"].on and verdicts["harmonic_source"].told, verdicts["harmonic_source"]
+
+
+@pytest.mark.parametrize(("told", "likely", "on"), [(False, True, True), (False, False, False), (True, True, False)])
+def test_what_cannot_be_told_is_simulated_where_it_is_likely(told, likely, on, monkeypatch):
+    found = Evidence(1.7, "gains a little", {"clouds": True}, told, 0.2, likely)
+    wind = replace(CATALOGUE[NAMES.index("convection")], evidence=lambda inspected: found)
+    monkeypatch.setattr(catalogue, "CATALOGUE", (wind,))
+    outdoors = replace(
+        scene_of(noise(8), [10.0 * i for i in range(8)], 50, ThermalRange(0.0, 10.0)), weather=make_weather()
+    )
+    verdict = decide(outdoors, {})["convection"]
+    assert (verdict.on, verdict.told, verdict.settings) == (on, told, {"clouds": True} if on else {})

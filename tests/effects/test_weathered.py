@@ -116,6 +116,16 @@ def test_a_sky_under_clouds_is_told_from_a_clear_one():
     assert not recorded().clouded
 
 
+def test_clouds_of_a_fair_day_warm_the_sky_though_nobody_can_tell():
+    assert recorded(clouds=lambda hours: 0.02 + 0.0 * hours, without="clouds").clouded
+
+
+@pytest.mark.parametrize(("sigmas", "likely"), [(1.7, True), (0.6, True), (0.4, False), (-1.7, False)])
+def test_wind_in_doubt_is_likely_where_it_gains(sigmas, likely):
+    seen = SimpleNamespace(gain=lambda name: HeldOut(0.1 * sigmas, sigmas, 48), shares={}, dark=True)
+    assert judged(seen, "convection", "").likely == likely
+
+
 def test_surfaces_that_rain_wets_are_told_from_those_under_a_roof():
     def showers(hours):
         return 2.0 * (((hours > 3) & (hours < 4)) | ((hours > 11) & (hours < 13))).double()

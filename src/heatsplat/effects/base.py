@@ -42,6 +42,7 @@ class Evidence:
         settings: what the effect should start from or be limited to, such as {"frequencies": 8}.
         told: False where the data do not say whether the effect is there; the reason says what would be needed.
         gain_db: what the effect gains on observations that it was not fitted to, in decibels of their squared error.
+        likely: whether it is simulated although that cannot be told, because it is there more often than not.
     """
 
     statistic: float | None
@@ -49,6 +50,7 @@ class Evidence:
     settings: dict[str, Any] = field(default_factory=dict)
     told: bool = True
     gain_db: float | None = None
+    likely: bool = False
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ class Verdict:
         reason: in a sentence.
         settings: what it starts from, handed to the configuration.
         told: False where the data do not say whether it is there; it is then simulated only as the best explanation of the
-            images that there is.
+            images that there is, or where it is likely (``Evidence``).
         gain_db: on observations that it was not fitted to (``Evidence``).
     """
 

@@ -65,6 +65,7 @@ def _verdict(effect: Effect, inspected: Inspection, choice: str) -> Verdict:
     known = evidence.statistic is not None and math.isfinite(evidence.statistic)
     # What was taken in without being certain is still the best explanation of the images that there is.
     on = known and evidence.statistic > effect.threshold and (evidence.told or evidence.gain_db is not None)
+    on |= evidence.likely and not evidence.told
     statistic = float(evidence.statistic) if known else None
     return Verdict(
         effect.name,

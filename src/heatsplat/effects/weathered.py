@@ -14,6 +14,7 @@ from torch import Tensor
 from heatsplat.contracts import Weather
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Evidence
+from heatsplat.effects.full_balance import FullBalance
 from heatsplat.effects.joint.held_out import CHANCE, FOLDS, WORST, HeldOut, compared, fold_of, would_tell
 from heatsplat.effects.observations import Tracks
 from heatsplat.geometry.exposure import felt_directions, lit_beside, sky_directions
@@ -37,14 +38,13 @@ NO_SUN = "the record has no irradiance, or the sun does not shine in it"
 NO_LIGHT = "nobody knows from where light comes, or how surfaces face it"
 PARTS = ("solar", "radiation", "convection")
 DEPTH = "depth"  # bodies with a core beside their surface
-CLOUDS = "clouds"  # clouds of the record warm the sky
 RAIN = "rain"  # rain of the record wets surfaces
 CONVECTS = 0.6  # of the exchange, which alone water hastens
 ENDLESS = "semi_infinite"  # bodies without an end, in the place of those of one rate
 # What the scene's own geometry does, which is asked for beside all of these: shadows, light that comes back from the ground, sky
 # that is mirrored; and hidden sky, which shows where beams and diffuse light are taken in one measure (ONE_LIGHT).
 SHADOWS, ALBEDO, MIRRORED, SKY_VIEW, ONE_LIGHT = "shadows", "albedo", "mirrored_sky", "sky_view", "one light"
-BEAMS = 5  # drivers before those of the sun's beams, one for each way that points face (``Weathered._drivers``)
+BEAMS = 4  # drivers before those of the sun's beams, one for each way that points face (``Weathered._drivers``)
 SKY_PARTS = 64  # of the sky that are asked whether they are open
 NEIGHBOURS = 6  # of a point, of whose temperature it takes a share where heat flows between them
 FLOW = 0.5  # that share, as expected
@@ -85,8 +85,12 @@ def judged(weathered: Weathered | None, name: str, why: str) -> Evidence:
         found, none = f"{found}; bodies take a share of {share:.2f}", not large
     nothing_db = NOTHING_DB if gain.sigmas <= PART_SIGMAS else 0.0  # what is no chance is there, however small
     if name == "radiation" and not weathered.dark:
-        return weighed(gain, found, large, False, "more of them in the dark", sigmas=PART_SIGMAS)
-    return weighed(gain, found, large, none, nothing_db=nothing_db, sigmas=PART_SIGMAS)
+        evidence = weighed(gain, found, large, False, "more of them in the dark", sigmas=PART_SIGMAS)
+    else:
+        evidence = weighed(gain, found, large, none, nothing_db=nothing_db, sigmas=PART_SIGMAS)
+    return replace(
+        evidence, likely=gain.sigmas > CHANCE
+    )  # sun, sky and wind are there more often than not under the sky
 
 
 def around(inspected: Inspection, name: str) -> Evidence:
@@ -181,11 +185,14 @@ class Weathered:
 
     @cached_property
     def clouded(self) -> bool:
-        """Whether a sky under the clouds of the record explains observations better that were left out than a clear one."""
+        """Whether clouds of the record warm the sky: they do, unless under a clear one full balances explain observations better
+        that were left out. Many a fair day does not tell, and overcast ones are foreseen wrongly without clouds."""
         if self.weather.clouds is None or "radiation" not in self.parts:
             return False
-        gain = compared(self.squares((*self.parts, CLOUDS)), self._whole, self.weights)
-        return gain.exceeds(MIN_DB, SIGMAS)
+        bodies = (self.times_s, self.values, self.errors, self.weights, self.normals)
+        clouded, clear = (FullBalance(self.weather, sky_k, *bodies) for sky_k in (self._clouded_k, self._sky_k))
+        squares = [(one.left_out**2 / one.variance).clamp(max=WORST) for one in (clouded, clear)]
+        return compared(*squares, self.weights).sigmas > -PART_SIGMAS
 
     @cached_property
     def rained(self) -> bool:
@@ -373,8 +380,6 @@ class Weathered:
         names += ["deep air"] if DEPTH in parts else []
         names += ["deep light"] if DEPTH in parts and "solar" in parts else []
         names += ["sky"] if "radiation" in parts else []
-        if CLOUDS in parts:
-            courses = courses | {"sky": courses["clouded sky"]}
         basis = [(EXPECTED[name] * courses[name]).expand(len(self.values), -1) for name in names]
         basis += [EXPECTED["mirror"] * self._mirrored] if MIRRORED in parts else []
         return courses["air"], torch.stack(basis, 2), names
@@ -471,21 +476,17 @@ class Weathered:
 
     @cached_property
     def _drivers(self) -> tuple[Tensor, Tensor]:
-        """Air in °C, then sky, diffuse and level light, the sky under clouds and beams in kelvin [T, d]; and wind over its
-        mean [T]."""
+        """Air in °C, then sky, diffuse and level light and beams in kelvin [T, d]; and wind over its mean [T]."""
         weather = self.weather
         zero = torch.zeros_like(weather.times_s)
         wind = zero + 1.0 if weather.wind_m_s is None else weather.wind_m_s / weather.wind_m_s.mean().clamp_min(0.1)
         light = zero if weather.irradiance_w_m2 is None else weather.irradiance_w_m2
-        clear, clouded = (
-            STEFAN_BOLTZMANN * (sky_k**4 - kelvin(weather.air_c) ** 4)[:, None]
-            for sky_k in (self._sky_k, self._clouded_k)
-        )
+        net = STEFAN_BOLTZMANN * (self._sky_k**4 - kelvin(weather.air_c) ** 4)
         beam, diffuse = light[:, None], zero
         if self.normals is not None and weather.direct_w_m2 is not None and weather.sun is not None:
             beam = weather.direct_w_m2[:, None] * (weather.sun @ self.normals.T).clamp_min(0.0)
             diffuse = zero if weather.diffuse_w_m2 is None else weather.diffuse_w_m2
-        power = torch.cat([clear, diffuse[:, None], light[:, None], clouded, beam], 1) / EXCHANGE_W_M2_K
+        power = torch.cat([torch.stack([net, diffuse, light], 1), beam], 1) / EXCHANGE_W_M2_K
         return torch.cat([weather.air_c[:, None], power], 1), wind
 
     @cached_property
@@ -543,6 +544,5 @@ class Weathered:
 
 def _named(answers: Tensor, start: Tensor) -> dict[str, Tensor]:
     """Answers [F, d] to ``Weathered._drivers`` and the decay of the start [F] by name."""
-    air, sky, diffuse, _, clouded = answers[:, :BEAMS].unbind(1)
-    beam = answers[:, BEAMS:].T
-    return {"air": air, "sky": sky, "clouded sky": clouded, "diffuse": diffuse, "beam": beam, "start": start}
+    air, sky, diffuse, _ = answers[:, :BEAMS].unbind(1)
+    return {"air": air, "sky": sky, "diffuse": diffuse, "beam": answers[:, BEAMS:].T, "start": start}

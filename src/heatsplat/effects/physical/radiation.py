@@ -37,7 +37,7 @@ EFFECT = Effect(
     threshold=PART_SIGMAS,
     adds="an emissivity for each Gaussian, one driver",
     evidence=evidence,
-    part=Part("state", "energy_balance", off={"sky": None}),
+    part=Part("state", "energy_balance", off={"sky": None, "clouds": False}),
     stands_on="relaxation",
     displaces=weather_record.INSTEAD,
 )

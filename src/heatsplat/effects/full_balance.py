@@ -1,0 +1,174 @@
+"""Full balances of heat, with T⁴ and gusts as they are, fitted to scene points under a weather record.
+
+Points follow their own balance within the noise where the record is right, three to ten times as closely as they do a balance
+that is linear in its parameters. That tells what fair days hardly show.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from heatsplat.contracts import Weather
+from heatsplat.effects.joint.held_out import FOLDS, fold_of
+from heatsplat.physics.energy_balance import Climate
+from heatsplat.physics.marching import march
+from heatsplat.physics.responses import driver_means
+from heatsplat.physics.surfaces import Core, Drivers, Surface, power_excess
+from heatsplat.physics.units import DAY_S, celsius, kelvin
+
+# Of bodies with a core (``physics.marching.UNITS``): the limits of what has some, and what a number before its sigmoid, or as it
+# is, is expected to be, with a standard deviation. A surface starts about its own mean, a core about the mean of the air.
+LIMITS = {"share": (0.02, 0.98), "sun": (0.0, 200.0), "wind": (0.0, 0.95)}
+EXPECTED = {
+    "start": (0.0, 10.0), "log_rate": (-math.log(3600.0), 1.5), "share": (-0.4, 1.0), "sun": (-2.2, 1.5), "wind": (-0.3, 1.0),
+    "core_start": (0.0, 3.0), "core_log_rate": (-math.log(6 * 3600.0), 1.5), "log_coupling": (-0.7, 1.5),
+}  # fmt: skip
+FIRST_S = (1200.0, 7200.0)  # time constants from which fits start
+STEPS, STEPS_ON = 12, 6  # of a fit, and of one that goes on from a fit to more observations
+MODEL_K = 0.1  # by which such bodies err themselves
+ROBUST = 3.0  # expected errors from which an observation counts for less
+MEMORY_S = 10.0 * DAY_S  # of the record before the first frame, after which starts no longer matter
+
+
+@dataclass(frozen=True, eq=False)
+class FullBalance:
+    """P points in F frames as bodies with a core, under the air, light and wind of a record and a sky.
+
+    Args:
+        weather: the record.
+        sky_k: [T] temperature of its sky.
+        times_s: [F] of the frames.
+        values, errors, weights: [P, F] temperatures in °C, what errors are to be expected, and 0 where a point is not seen.
+        normals: [P, 3] of the surface, or None: points lie level.
+    """
+
+    weather: Weather
+    sky_k: Tensor
+    times_s: Tensor
+    values: Tensor
+    errors: Tensor
+    weights: Tensor
+    normals: Tensor | None
+
+    @cached_property
+    def left_out(self) -> Tensor:
+        """What balances err by at observations that they were not fitted to, [P, F] in kelvin."""
+        starts = [self._expected.clone() for _ in FIRST_S]
+        for numbers, time_s in zip(starts, FIRST_S, strict=True):
+            numbers[:, self._names.index("log_rate")] = -math.log(time_s)
+        whole = self._fitted(self.weights > 0, starts, STEPS)[0]
+        fold, left = fold_of(*self.values.shape), torch.zeros_like(self.values)
+        for k in range(FOLDS):
+            found = self._fitted((self.weights > 0) & (fold != k), [whole], STEPS_ON)[1]
+            left = torch.where(fold == k, self._above - found, left)
+        return left
+
+    @property
+    def variance(self) -> Tensor:
+        """What squares of ``left_out`` are to be expected, [P, F]."""
+        return self.errors**2 + MODEL_K**2
+
+    @cached_property
+    def _climate(self) -> Climate:
+        weather = self.weather
+        forgotten = int((weather.times_s < float(self.times_s.min()) - MEMORY_S).sum())
+        kept = slice(max(forgotten - 1, 0), None)
+        reference_k = float(kelvin(driver_means(weather.times_s, weather.air_c)))
+        air = kelvin(weather.air_c) - reference_k
+        drivers = {"air": air, "sky": power_excess(self.sky_k - reference_k, reference_k)}
+        if weather.wind_m_s is not None and bool((weather.wind_m_s > 0).any()):
+            drivers["wind_anomaly"] = weather.wind_m_s / driver_means(weather.times_s, weather.wind_m_s) - 1.0
+        if None not in (self.normals, weather.sun, weather.direct_w_m2, weather.diffuse_w_m2):
+            drivers |= {"around": power_excess(air, reference_k), "light": weather.diffuse_w_m2 / 1000.0}
+            drivers["beams"] = weather.direct_w_m2[:, None] * weather.sun / 1000.0
+        elif weather.irradiance_w_m2 is not None:
+            drivers["light"] = weather.irradiance_w_m2 / 1000.0
+        up = weather.up.double() if "beams" in drivers else None
+        series = {name: values[kept] for name, values in drivers.items()}
+        return Climate(Drivers(weather.times_s[kept], reference_k, up=up, **series))
+
+    @cached_property
+    def _names(self) -> list[str]:
+        """Of the numbers of a body, in the order in which derivatives by them come."""
+        drivers = self._climate.drivers
+        absent = {"sun"} if drivers.light is None else set()
+        absent |= {"wind"} if drivers.wind_anomaly is None else set()
+        return [name for name in EXPECTED if name not in absent]
+
+    @cached_property
+    def _above(self) -> Tensor:
+        """Temperatures [P, F] above the reference."""
+        return self.values - celsius(self._climate.drivers.reference_k)
+
+    @cached_property
+    def _expected(self) -> Tensor:
+        """Numbers [P, Q] that are expected of each body."""
+        seen = self.weights > 0
+        expected = self.values.new_tensor([EXPECTED[name][0] for name in self._names]).repeat(len(self.values), 1)
+        expected[:, 0] = (self._above * seen).sum(1) / seen.sum(1).clamp_min(1)
+        return expected
+
+    def _temperatures(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """Temperatures [P, F] above the reference of bodies of these numbers [P, Q], with derivatives by them [P, F, Q]."""
+        found, slopes = {}, torch.ones_like(numbers)
+        for place, name in enumerate(self._names):
+            found[name] = numbers[:, place]
+            if name in LIMITS:
+                low, high = LIMITS[name]
+                share = torch.sigmoid(numbers[:, place])
+                found[name], slopes[:, place] = low + (high - low) * share, (high - low) * share * (1.0 - share)
+        core = Core(found.pop("core_start"), found.pop("core_log_rate"), found.pop("log_coupling").exp())
+        normals = None if self._climate.drivers.up is None else self.normals.double()
+        surface = Surface(**{"sun": None} | found, normals=normals, core=core)
+        moments, order = self.times_s.sort()
+        marched = march(self._climate, surface, moments)[order.argsort()].transpose(0, 1)
+        return marched[..., 0], marched[..., 1:] * slopes[:, None]
+
+    def _fitted(self, used: Tensor, starts: Sequence[Tensor], steps: int) -> tuple[Tensor, Tensor]:
+        """Likeliest numbers [P, Q], and temperatures [P, F] of such bodies: Levenberg's and Marquardt's method, for each point
+        from the best of the starts.
+
+        Args:
+            used: [P, F] observations that count.
+        """
+        spread = self.values.new_tensor([EXPECTED[name][1] for name in self._names])
+
+        def unlikely(found: Tensor, numbers: Tensor) -> Tensor:
+            """Squares of the errors, far ones no more than linear (Huber), with those of the numbers, [P]."""
+            missed = (self._above - found).abs() / self.variance.sqrt()
+            squares = torch.where(missed < ROBUST, missed**2, 2.0 * ROBUST * missed - ROBUST**2)
+            return (squares * used).sum(1) + (((numbers - self._expected) / spread) ** 2).sum(1)
+
+        best = None
+        for numbers in starts:
+            damping = torch.full_like(numbers[:, 0], 0.1)
+            found, slopes = self._temperatures(numbers)
+            cost = unlikely(found, numbers)
+            for _ in range(steps):
+                left = self._above - found
+                counts = used / self.variance * (ROBUST * self.variance.sqrt() / left.abs()).clamp(max=1.0)
+                inner = torch.einsum("pf,pfi,pfj->pij", counts, slopes, slopes) + torch.diag(spread**-2)
+                pull = torch.einsum("pf,pfi,pf->pi", counts, slopes, left) - (numbers - self._expected) / spread**2
+                held = inner + torch.diag_embed(damping[:, None] * inner.diagonal(dim1=1, dim2=2))
+                moved = numbers + torch.linalg.solve(held, pull).clamp(-2.0 * spread, 2.0 * spread)
+                there, steeper = self._temperatures(moved)
+                costs = unlikely(there, moved)
+                better = costs < cost
+                numbers, found = (torch.where(better[:, None], *pair) for pair in ((moved, numbers), (there, found)))
+                slopes, cost = torch.where(better[:, None, None], steeper, slopes), torch.where(better, costs, cost)
+                damping = torch.where(better, 0.3 * damping, 5.0 * damping).clamp(1e-6, 1e4)
+            if best is None:
+                best = numbers, found, cost
+            else:
+                better = cost < best[2]
+                numbers, found = (
+                    torch.where(better[:, None], *pair) for pair in ((numbers, best[0]), (found, best[1]))
+                )
+                best = numbers, found, torch.minimum(cost, best[2])
+        return best[:2]

@@ -1,0 +1,136 @@
+"""Full balances fitted to points, beside bodies that a stiff solver integrated."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from weathered import HOUR_S, make_weather
+
+from heatsplat.effects.full_balance import MODEL_K, FullBalance
+from heatsplat.effects.joint.held_out import compared
+from heatsplat.physics.sky import sky_temperature_k
+from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN, kelvin
+
+POINTS, FRAMES, NOISE_K = 24, 40, 0.1
+EXCHANGE = 8.0  # W/(m² K) with the air at the mean wind, of which half comes of it
+WEATHER = make_weather(direct_w_m2=None, diffuse_w_m2=None, sun=None)
+
+
+def sky(clouds) -> torch.Tensor:
+    """Temperature [T] of a sky of which clouds close this share."""
+    return sky_temperature_k(kelvin(WEATHER.air_c), WEATHER.humidity_percent, "brutsaert", clouds)
+
+
+PASSING = sky(0.5 + 0.5 * torch.sin(2.0 * torch.pi * WEATHER.times_s / (5.0 * HOUR_S)))
+
+
+@cache
+def seen() -> tuple[torch.Tensor, torch.Tensor]:
+    """Times [F] of frames, and temperatures [P, F] of level bodies with a core under PASSING, in °C."""
+    draw = np.random.default_rng(0).uniform
+    moments = np.sort(draw(0.0, 18.0 * HOUR_S, FRAMES))
+    times = WEATHER.times_s.numpy()
+    series = [kelvin(WEATHER.air_c), PASSING, WEATHER.irradiance_w_m2, WEATHER.wind_m_s / WEATHER.wind_m_s.mean()]
+    values = []
+    for _ in range(POINTS):
+        takes, emits, capacity, core = draw(0.3, 0.9), draw(0.8, 0.97), draw(1e4, 6e4), draw(1e5, 4e5)
+
+        def change(time, state, takes=takes, emits=emits, capacity=capacity, core=core):
+            air, sky_k, light, wind = (np.interp(time, times, one) for one in series)
+            inwards = 6.0 * (state[0] - state[1])
+            heat = takes * light + emits * STEFAN_BOLTZMANN * (sky_k**4 - state[0] ** 4)
+            heat += EXCHANGE * (0.5 + 0.5 * wind) * (air - state[0]) - inwards
+            return np.array([heat / capacity, inwards / core])
+
+        start = np.array([290.0 + draw(-4.0, 4.0), 288.0])
+        course = solve_ivp(
+            change, (times[0], moments[-1]), start, "Radau", moments, rtol=1e-7, atol=1e-5, max_step=HOUR_S / 4
+        )
+        values.append(course.y[0] - KELVIN_AT_0_C)
+    return torch.from_numpy(moments), torch.from_numpy(np.array(values))
+
+
+def balance(sky_k=PASSING, weather=WEATHER, **changed) -> FullBalance:
+    """Of these bodies, with noise."""
+    moments, values = seen()
+    noise = torch.randn(values.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    ones = torch.ones_like(values)
+    parts = {"values": values + NOISE_K * noise, "errors": NOISE_K * ones, "weights": ones, "normals": None}
+    return FullBalance(weather, sky_k, moments, **(parts | changed))
+
+
+def test_bodies_are_foreseen_within_twice_the_noise():
+    left = balance().left_out
+    assert left.square().mean().sqrt() < 2.0 * NOISE_K
+    assert left.abs().median() < 1.2 * 0.67 * NOISE_K
+
+
+def test_the_sky_that_there_was_foresees_better():
+    there, clear = (balance(sky_k).left_out for sky_k in (PASSING, sky(0.0)))
+    gain = compared(there**2, clear**2, torch.ones_like(there))
+    assert gain.db > 1.0 and gain.sigmas > 3.0, gain
+
+
+def test_what_is_not_seen_does_not_count():
+    moments, values = seen()
+    weights = torch.ones_like(values)
+    weights[:, ::5] = 0.0
+    wrong = torch.where(weights > 0, balance().values, 500.0)
+    spoilt, kept = (balance(values=one, weights=weights).left_out[:, 1::5] for one in (wrong, balance().values))
+    torch.testing.assert_close(spoilt, kept, rtol=0.0, atol=0.0)
+
+
+def test_frames_in_any_order_and_a_long_record_before_them_change_nothing():
+    order = torch.randperm(FRAMES, generator=torch.Generator().manual_seed(2))
+    one = balance()
+    mixed = replace(
+        one, times_s=one.times_s[order], **{n: getattr(one, n)[:, order] for n in ("values", "errors", "weights")}
+    )
+    torch.testing.assert_close(mixed._climate.drivers.air, one._climate.drivers.air)
+    numbers = one._expected
+    torch.testing.assert_close(mixed._temperatures(numbers)[0], one._temperatures(numbers)[0][:, order], rtol=0, atol=0)
+    days = torch.arange(-40.0, -1.0, dtype=torch.float64) * 86400.0
+
+    def before(series):
+        return torch.cat([torch.full_like(days, float(series[0])), series])
+
+    names = ("air_c", "wind_m_s", "humidity_percent", "irradiance_w_m2")
+    longer = replace(
+        WEATHER,
+        times_s=torch.cat([days, WEATHER.times_s]),
+        pressure_hpa=None,
+        **{n: before(getattr(WEATHER, n)) for n in names},
+    )
+    since = balance(before(PASSING), longer)._climate.drivers.times_s
+    assert len(since) == len(WEATHER.times_s) + 9
+
+
+@pytest.mark.parametrize("without", ["wind_m_s", "irradiance_w_m2"])
+def test_what_a_record_lacks_has_no_numbers(without):
+    lacking = balance(weather=replace(WEATHER, **{without: None}))
+    assert {"wind_m_s": "wind", "irradiance_w_m2": "sun"}[without] not in lacking._names
+    assert torch.isfinite(lacking.left_out).all()
+
+
+def test_beams_fall_on_points_as_they_lie():
+    normals = torch.nn.functional.normalize(torch.randn(POINTS, 3, generator=torch.Generator().manual_seed(3)), dim=1)
+    lying = balance(weather=make_weather(), normals=normals)
+    warm, slopes = lying._temperatures(lying._expected)
+    step = torch.zeros_like(lying._expected)
+    step[:, lying._names.index("sun")] = 1e-4
+    more, less = (lying._temperatures(lying._expected + way * step)[0] for way in (1.0, -1.0))
+    torch.testing.assert_close((more - less) / 2e-4, slopes[..., lying._names.index("sun")], rtol=5e-3, atol=5e-3)
+    assert float((warm.amax(0) - warm.amin(0)).amax()) > 3.0  # those that face the sun are warmer
+
+
+def test_numbers_of_the_same_fit_are_the_same_bits():
+    assert torch.equal(balance().left_out, balance().left_out)
+
+
+def test_errors_of_the_balance_itself_are_expected():
+    assert torch.allclose(
+        balance().variance, torch.full((POINTS, FRAMES), NOISE_K**2 + MODEL_K**2, dtype=torch.float64)
+    )
