@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from weathered import HOUR_S, make_weather
 
 from heatsplat.effects.full_balance import MODEL_K, FullBalance
-from heatsplat.effects.joint.held_out import compared
+from heatsplat.effects.joint.held_out import WORST, compared
 from heatsplat.physics.sky import sky_temperature_k
 from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN, kelvin
 
@@ -130,7 +130,18 @@ def test_numbers_of_the_same_fit_are_the_same_bits():
     assert torch.equal(balance().left_out, balance().left_out)
 
 
+@pytest.mark.parametrize(("name", "least_db"), [("solar", 5.0), ("radiation", 1.0), ("convection", 0.3)])
+def test_what_drives_bodies_is_missed_where_it_is_left_out(name, least_db):
+    whole = balance()
+    gain = compared(whole.squares, whole.without(name).squares, whole.weights)
+    assert gain.db > least_db and gain.sigmas > 3.0, gain
+
+
+def test_a_steady_wind_gains_nothing():
+    steady = balance(weather=replace(WEATHER, wind_m_s=torch.full_like(WEATHER.times_s, 2.0)))
+    torch.testing.assert_close(steady.squares, steady.without("convection").squares)
+
+
 def test_errors_of_the_balance_itself_are_expected():
-    assert torch.allclose(
-        balance().variance, torch.full((POINTS, FRAMES), NOISE_K**2 + MODEL_K**2, dtype=torch.float64)
-    )
+    whole = balance()
+    torch.testing.assert_close(whole.squares, (whole.left_out**2 / (NOISE_K**2 + MODEL_K**2)).clamp(max=WORST))

@@ -120,10 +120,33 @@ def test_clouds_of_a_fair_day_warm_the_sky_though_nobody_can_tell():
     assert recorded(clouds=lambda hours: 0.02 + 0.0 * hours, without="clouds").clouded
 
 
+NONE = HeldOut(-0.1, -1.0, 48)
+
+
+def gains(linear: HeldOut, full: HeldOut = NONE, share: float = 0.0) -> SimpleNamespace:
+    """Points whose balances gain this by each part, of which bodies take this share."""
+    shares = {"solar": share, "radiation": share}
+    return SimpleNamespace(gain=lambda name: linear, full_gain=lambda name: full, shares=shares, dark=True)
+
+
 @pytest.mark.parametrize(("sigmas", "likely"), [(1.7, True), (0.6, True), (0.4, False), (-1.7, False)])
 def test_wind_in_doubt_is_likely_where_it_gains(sigmas, likely):
-    seen = SimpleNamespace(gain=lambda name: HeldOut(0.1 * sigmas, sigmas, 48), shares={}, dark=True)
-    assert judged(seen, "convection", "").likely == likely
+    assert judged(gains(HeldOut(0.1 * sigmas, sigmas, 48)), "convection", "").likely == likely
+
+
+@pytest.mark.parametrize(
+    ("linear", "full", "told", "sigmas"),
+    [
+        (HeldOut(0.3, 2.5, 48), HeldOut(0.01, 0.1, 48), True, 2.5),  # few frames
+        (HeldOut(0.0, 0.0, 48), HeldOut(0.1, 3.0, 48), True, 3.0),  # many
+        (HeldOut(0.1, 4.0, 48), HeldOut(0.1, 3.0, 48), True, 3.0),  # linear ones gain too little
+        (HeldOut(0.1, 1.5, 48), HeldOut(0.02, 1.0, 48), False, 1.5),
+        (HeldOut(0.04, 0.4, 48), HeldOut(-0.1, -1.0, 48), True, 0.4),  # absent
+    ],
+)
+def test_the_balances_that_tell_more_are_asked(linear, full, told, sigmas):
+    evidence = judged(gains(linear, full), "convection", "")
+    assert (evidence.told, evidence.statistic) == (told, sigmas)
 
 
 def test_surfaces_that_rain_wets_are_told_from_those_under_a_roof():
@@ -164,8 +187,7 @@ def test_a_body_with_a_core_has_two_nodes():
     ],
 )
 def test_a_part_is_absent_if_it_gains_nothing_and_nothing_says_that_it_may_be_there(name, gain, share, told):
-    seen = SimpleNamespace(gain=lambda name: gain, shares={"solar": share, "radiation": share}, dark=True)
-    evidence = judged(seen, name, "")
+    evidence = judged(gains(gain, share=share), name, "")
     assert evidence.told == told and evidence.statistic < 4, evidence
 
 

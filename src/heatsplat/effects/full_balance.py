@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from heatsplat.contracts import Weather
-from heatsplat.effects.joint.held_out import FOLDS, fold_of
+from heatsplat.effects.joint.held_out import FOLDS, WORST, fold_of
 from heatsplat.physics.energy_balance import Climate
 from heatsplat.physics.marching import march
 from heatsplat.physics.responses import driver_means
@@ -56,6 +56,25 @@ class FullBalance:
     weights: Tensor
     normals: Tensor | None
 
+    def without(self, name: str) -> FullBalance:
+        """The same without "solar", "radiation" or "convection": in the dark, under a sky as warm as the air, or in a
+        steady wind."""
+        weather = self.weather
+        if name == "radiation":
+            return replace(self, sky_k=kelvin(weather.air_c))
+        if name == "convection":
+            return replace(self, weather=replace(weather, wind_m_s=torch.ones_like(weather.times_s)))
+        light = ("irradiance_w_m2", "direct_w_m2", "diffuse_w_m2")
+        given = {one: series for one in light if (series := getattr(weather, one)) is not None}
+        return replace(
+            self, weather=replace(weather, **{one: torch.zeros_like(series) for one, series in given.items()})
+        )
+
+    @cached_property
+    def squares(self) -> Tensor:
+        """Squares of ``left_out`` in those that are to be expected, [P, F], of single ones no more than WORST."""
+        return (self.left_out**2 / self._variance).clamp(max=WORST)
+
     @cached_property
     def left_out(self) -> Tensor:
         """What balances err by at observations that they were not fitted to, [P, F] in kelvin."""
@@ -70,8 +89,7 @@ class FullBalance:
         return left
 
     @property
-    def variance(self) -> Tensor:
-        """What squares of ``left_out`` are to be expected, [P, F]."""
+    def _variance(self) -> Tensor:
         return self.errors**2 + MODEL_K**2
 
     @cached_property
@@ -141,7 +159,7 @@ class FullBalance:
 
         def unlikely(found: Tensor, numbers: Tensor) -> Tensor:
             """Squares of the errors, far ones no more than linear (Huber), with those of the numbers, [P]."""
-            missed = (self._above - found).abs() / self.variance.sqrt()
+            missed = (self._above - found).abs() / self._variance.sqrt()
             squares = torch.where(missed < ROBUST, missed**2, 2.0 * ROBUST * missed - ROBUST**2)
             return (squares * used).sum(1) + (((numbers - self._expected) / spread) ** 2).sum(1)
 
@@ -152,7 +170,7 @@ class FullBalance:
             cost = unlikely(found, numbers)
             for _ in range(steps):
                 left = self._above - found
-                counts = used / self.variance * (ROBUST * self.variance.sqrt() / left.abs()).clamp(max=1.0)
+                counts = used / self._variance * (ROBUST * self._variance.sqrt() / left.abs()).clamp(max=1.0)
                 inner = torch.einsum("pf,pfi,pfj->pij", counts, slopes, slopes) + torch.diag(spread**-2)
                 pull = torch.einsum("pf,pfi,pf->pi", counts, slopes, left) - (numbers - self._expected) / spread**2
                 held = inner + torch.diag_embed(damping[:, None] * inner.diagonal(dim1=1, dim2=2))

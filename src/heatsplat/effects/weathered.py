@@ -33,6 +33,7 @@ SIGMAS = 3.0
 # of 32 that were in 38 scenes drawn at random one gained 2.8 standard errors, one 1.9, and the others 1.0 at most.
 PART_SIGMAS = 2.0
 MIN_DB, NOTHING_DB, MUCH_DB = 0.2, 0.05, 0.5
+FULL_DB = 0.05  # that are a gain where full balances tell it
 NO_BALANCE = "there is no record of the air's temperature, or no point to follow through the images"
 NO_SUN = "the record has no irradiance, or the sun does not shine in it"
 NO_LIGHT = "nobody knows from where light comes, or how surfaces face it"
@@ -75,7 +76,9 @@ def judged(weathered: Weathered | None, name: str, why: str) -> Evidence:
     """
     if weathered is None:
         return Evidence(None, why, told=False)
-    gain = weathered.gain(name)
+    # Where frames are few, linear balances are told by what is expected of them; of many, full ones explain three times as much.
+    told = (weathered.gain(name), MIN_DB), (weathered.full_gain(name), FULL_DB)
+    gain, least_db = max(told, key=lambda one: (one[0].exceeds(one[1], PART_SIGMAS), one[0].sigmas))
     found = f"balances of heat gain {gain.db:.2f} dB by it where left out, {gain.sigmas:.1f} standard errors"
     large, none = True, True
     if name in LEAST:
@@ -83,11 +86,11 @@ def judged(weathered: Weathered | None, name: str, why: str) -> Evidence:
         large = share > LEAST[name]
         # Few frames gain nothing by it, but what bodies take says that it may be there. Where it is not, that is 0.02 at most.
         found, none = f"{found}; bodies take a share of {share:.2f}", not large
-    nothing_db = NOTHING_DB if gain.sigmas <= PART_SIGMAS else 0.0  # what is no chance is there, however small
+    nothing_db = 0.25 * least_db if gain.sigmas <= PART_SIGMAS else 0.0  # what is no chance is there, however small
     if name == "radiation" and not weathered.dark:
-        evidence = weighed(gain, found, large, False, "more of them in the dark", sigmas=PART_SIGMAS)
+        evidence = weighed(gain, found, large, False, "more of them in the dark", least_db, sigmas=PART_SIGMAS)
     else:
-        evidence = weighed(gain, found, large, none, nothing_db=nothing_db, sigmas=PART_SIGMAS)
+        evidence = weighed(gain, found, large, none, "", least_db, nothing_db, PART_SIGMAS)
     return replace(
         evidence, likely=gain.sigmas > CHANCE
     )  # sun, sky and wind are there more often than not under the sky
@@ -189,10 +192,14 @@ class Weathered:
         that were left out. Many a fair day does not tell, and overcast ones are foreseen wrongly without clouds."""
         if self.weather.clouds is None or "radiation" not in self.parts:
             return False
+        clouded = replace(self.full, sky_k=self._clouded_k)
+        return compared(clouded.squares, self.full.squares, self.weights).sigmas > -PART_SIGMAS
+
+    @cached_property
+    def full(self) -> FullBalance:
+        """Full balances of the points under a clear sky."""
         bodies = (self.times_s, self.values, self.errors, self.weights, self.normals)
-        clouded, clear = (FullBalance(self.weather, sky_k, *bodies) for sky_k in (self._clouded_k, self._sky_k))
-        squares = [(one.left_out**2 / one.variance).clamp(max=WORST) for one in (clouded, clear)]
-        return compared(*squares, self.weights).sigmas > -PART_SIGMAS
+        return FullBalance(self.weather, self._sky_k, *bodies)
 
     @cached_property
     def rained(self) -> bool:
@@ -209,8 +216,12 @@ class Weathered:
         return wet if wet is not None and bool((wet > 0).any()) else None
 
     def gain(self, name: str) -> HeldOut:
-        """What one of the parts gains beside the others."""
+        """What one of the parts gains beside the others in linear balances."""
         return compared(self._whole, self.squares(self._others(name)), self.weights)
+
+    def full_gain(self, name: str) -> HeldOut:
+        """What one of PARTS gains beside the others in full balances."""
+        return compared(self.full.squares, self.full.without(name).squares, self.weights)
 
     def beside(self, name: str) -> HeldOut | None:
         """What one of SHADOWS, ALBEDO, MIRRORED and SKY_VIEW gains; None where nobody knows how surfaces face light or, but for
