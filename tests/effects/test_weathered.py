@@ -28,35 +28,29 @@ from heatsplat.effects.weathered import (
     weighed,
 )
 from heatsplat.physics.sky import sky_temperature_k
-from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN, kelvin
-from heatsplat.physics.wetness import FILM_MM, rained_on, wetted
+from heatsplat.physics.units import KELVIN_AT_0_C, STEFAN_BOLTZMANN
+from heatsplat.physics.wetness import FILM_MM
 
 POINTS, FRAMES, STEP_S = 60, 48, 120.0
 
 
 @cache
 def recorded_at(time_s):
-    """What the weather of all recordings here is at a moment, their clouds and rain aside."""
+    """What the weather of all recordings here is at a moment, their clouds aside."""
     return make_weather().at(time_s)
 
 
-def recorded(without="", depth=0.0, lit=None, clouds=None, rain=None, **seen):
+def recorded(without="", depth=0.0, lit=None, clouds=None, **seen):
     """Points under a weather, integrated in small steps; noise of 0.1 K.
 
     Args:
         clouds: (hours of the record) -> share of the sky that they close; None: the sky is clear, and the record tells none.
-        rain: (hours of the record) -> millimetres an hour; None: the record tells none.
         lit: (the sun's direction) -> whether each point is lit by its beams; None: they are level, and irradiance is all light.
         seen: what ``Weathered`` knows beside temperatures.
     """
     weather = make_weather()
     if clouds is not None:
         weather = replace(weather, clouds=clouds(weather.times_s / HOUR_S))
-    wet = torch.zeros_like(weather.times_s)
-    if rain is not None:
-        weather = replace(weather, rain_mm_h=rain(weather.times_s / HOUR_S))
-        wet = wet if without == "rain" else rained_on(weather, FILM_MM)
-    found_k, times_as_fast = wetted(kelvin(weather.air_c), weather.humidity_percent, wet)
     generator = torch.Generator().manual_seed(3)
     rate = torch.exp(torch.rand(POINTS, generator=generator, dtype=torch.float64) * 2.0) / (4 * HOUR_S)
     takes = 0.3 + 0.5 * torch.rand(POINTS, generator=generator, dtype=torch.float64)
@@ -74,9 +68,6 @@ def recorded(without="", depth=0.0, lit=None, clouds=None, rain=None, **seen):
             net = STEFAN_BOLTZMANN * float(sky_temperature_k(air_k, moist, "brutsaert", closed) ** 4 - air_k**4)
             wind = 1.0 if without == "convection" else (1 + 1.5 * here.wind_m_s / float(weather.wind_m_s.mean())) / 2.5
             driven = wind * (here.air_c - temperature)
-            if float(wet[at]) > 0:  # six tenths of the exchange are with the air
-                air_c, faster = float(found_k[at]) - KELVIN_AT_0_C, float(times_as_fast[at])
-                driven = wind * (0.4 * (here.air_c - temperature) + 0.6 * faster * (air_c - temperature))
             light = here.irradiance_w_m2
             if lit is not None:
                 beam = float(weather.direct_w_m2[at] * weather.sun[at, 2].clamp_min(0))
@@ -149,14 +140,10 @@ def test_the_balances_that_tell_more_are_asked(linear, full, told, sigmas):
     assert (evidence.told, evidence.statistic) == (told, sigmas)
 
 
-def test_surfaces_that_rain_wets_are_told_from_those_under_a_roof():
-    def showers(hours):
-        return 2.0 * (((hours > 3) & (hours < 4)) | ((hours > 11) & (hours < 13))).double()
-
-    assert recorded(rain=showers).rained
-    assert not recorded(rain=showers, without="rain").rained
-    assert not recorded(rain=lambda hours: 0.0 * hours).rained
-    assert not recorded().rained
+def test_rain_that_nobody_recorded_or_that_did_not_fall_wets_nothing():
+    dry = make_weather(rain_mm_h=torch.zeros_like(make_weather().times_s))
+    for weather in (make_weather(), dry, make_weather(rain_mm_h=dry.rain_mm_h + 1.0, humidity_percent=None)):
+        assert not replace(recorded(), weather=weather).rained
 
 
 @pytest.mark.parametrize(

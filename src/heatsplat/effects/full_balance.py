@@ -21,6 +21,7 @@ from heatsplat.physics.marching import march
 from heatsplat.physics.responses import driver_means
 from heatsplat.physics.surfaces import Core, Drivers, Surface, power_excess
 from heatsplat.physics.units import DAY_S, celsius, kelvin
+from heatsplat.physics.wetness import drying_mm_s_k, vapour_k
 
 # Of bodies with a core (``physics.marching.UNITS``): the limits of what has some, and what a number before its sigmoid, or as it
 # is, is expected to be, with a standard deviation. A surface starts about its own mean, a core about the mean of the air.
@@ -46,6 +47,7 @@ class FullBalance:
         times_s: [F] of the frames.
         values, errors, weights: [P, F] temperatures in °C, what errors are to be expected, and 0 where a point is not seen.
         normals: [P, 3] of the surface, or None: points lie level.
+        film_mm: of the record's rain that stay on surfaces until they have evaporated; None: surfaces stay dry.
     """
 
     weather: Weather
@@ -55,6 +57,7 @@ class FullBalance:
     errors: Tensor
     weights: Tensor
     normals: Tensor | None
+    film_mm: float | None = None
 
     def without(self, name: str) -> FullBalance:
         """The same without "solar", "radiation" or "convection": in the dark, under a sky as warm as the air, or in a
@@ -107,9 +110,12 @@ class FullBalance:
             drivers["beams"] = weather.direct_w_m2[:, None] * weather.sun / 1000.0
         elif weather.irradiance_w_m2 is not None:
             drivers["light"] = weather.irradiance_w_m2 / 1000.0
+        if self.film_mm is not None:
+            drivers |= {"rain": weather.rain_mm_h / 3600.0, "dries": drying_mm_s_k(weather)}
+            drivers["vapour"] = vapour_k(kelvin(weather.air_c), weather.humidity_percent)
         up = weather.up.double() if "beams" in drivers else None
         series = {name: values[kept] for name, values in drivers.items()}
-        return Climate(Drivers(weather.times_s[kept], reference_k, up=up, **series))
+        return Climate(Drivers(weather.times_s[kept], reference_k, up=up, holds_mm=self.film_mm or 0.0, **series))
 
     @cached_property
     def _names(self) -> list[str]:

@@ -21,8 +21,8 @@ from heatsplat.geometry.exposure import felt_directions, lit_beside, sky_directi
 from heatsplat.geometry.rotations import reflected
 from heatsplat.physics.responses import semi_infinite_weights
 from heatsplat.physics.sky import emissivity_towards, law_for, optical_depth, sky_temperature_k
-from heatsplat.physics.units import STEFAN_BOLTZMANN, celsius, kelvin
-from heatsplat.physics.wetness import FILM_MM, rained_on, wetted
+from heatsplat.physics.units import STEFAN_BOLTZMANN, kelvin
+from heatsplat.physics.wetness import FILM_MM
 
 if TYPE_CHECKING:
     from heatsplat.effects.inspection import Inspection
@@ -39,8 +39,6 @@ NO_SUN = "the record has no irradiance, or the sun does not shine in it"
 NO_LIGHT = "nobody knows from where light comes, or how surfaces face it"
 PARTS = ("solar", "radiation", "convection")
 DEPTH = "depth"  # bodies with a core beside their surface
-RAIN = "rain"  # rain of the record wets surfaces
-CONVECTS = 0.6  # of the exchange, which alone water hastens
 ENDLESS = "semi_infinite"  # bodies without an end, in the place of those of one rate
 # What the scene's own geometry does, which is asked for beside all of these: shadows, light that comes back from the ground, sky
 # that is mirrored; and hidden sky, which shows where beams and diffuse light are taken in one measure (ONE_LIGHT).
@@ -204,16 +202,11 @@ class Weathered:
     @cached_property
     def rained(self) -> bool:
         """Whether surfaces that the record's rain wets explain observations better that were left out than dry ones do."""
-        if self._wet is None:
+        weather = self.weather
+        if weather.rain_mm_h is None or weather.humidity_percent is None or not bool((weather.rain_mm_h > 0).any()):
             return False
-        gain = compared(self.squares((*self.parts, RAIN), True), self.squares(self.parts, True), self.weights)
-        return gain.exceeds(MIN_DB, PART_SIGMAS)
-
-    @cached_property
-    def _wet(self) -> Tensor | None:
-        """Share [T] of surfaces that rain has left wet; None where none falls, or nobody knows."""
-        wet = rained_on(self.weather, FILM_MM)
-        return wet if wet is not None and bool((wet > 0).any()) else None
+        wet = replace(self.full, film_mm=FILM_MM)
+        return compared(wet.squares, self.full.squares, self.weights).exceeds(MIN_DB, PART_SIGMAS)
 
     def gain(self, name: str) -> HeldOut:
         """What one of the parts gains beside the others in linear balances."""
@@ -382,7 +375,7 @@ class Weathered:
         """What the air makes of a body of a rate [F], what its own numbers multiply [P, F, k], and their names."""
         courses = self._endless if ENDLESS in parts else self._courses
         light = next((name for name in (SHADOWS, SKY_VIEW, ONE_LIGHT) if name in parts), None)
-        courses = self._wet_courses if RAIN in parts else courses if light is None else self._lit(light)
+        courses = courses if light is None else self._lit(light)
         courses = courses[winds, number]
         names = ["start"]
         names += ["beam"] if "solar" in parts else []
@@ -438,23 +431,6 @@ class Weathered:
                 for number in range(len(RATES_PER_S))
             }
         return self._variants[light]
-
-    @cached_property
-    def _wet_courses(self) -> dict[tuple[float, int], dict[str, Tensor]]:
-        """``_courses``, for the wind that there is, of surfaces that rain wets."""
-        weather = self.weather
-        found_k, times = wetted(kelvin(weather.air_c), weather.humidity_percent, self._wet)
-        hastened = 1.0 + CONVECTS * (times - 1.0)
-        air = weather.air_c + CONVECTS * times * (celsius(found_k) - weather.air_c) / hastened
-        drivers, exchange = torch.cat([air[:, None], self._drivers[0][:, 1:]], 1), self._exchange(self.wind) * hastened
-        near, start = self._answers(drivers, exchange, RATES_PER_S)
-        deep, _ = self._answers(drivers, exchange, [DEEPER * rate for rate in RATES_PER_S])
-        return {
-            (self.wind, number): self._courses[self.wind, number]
-            | _named(near[number], start[number])
-            | {"deep air": deep[number, :, 0] - near[number, :, 0], "deep light": deep[number, :, 3]}
-            for number in range(len(RATES_PER_S))
-        }
 
     @cached_property
     def _variants(self) -> dict[str, dict[tuple[float, int], dict[str, Tensor]]]:
