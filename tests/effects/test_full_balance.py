@@ -55,8 +55,9 @@ def seen() -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(moments), torch.from_numpy(np.array(values))
 
 
-def under(rain_mm_h) -> torch.Tensor:
-    """Temperatures [P, F] in °C, with noise, of light bodies without a core that keep 0.3 mm of this rain [T]; steps of 20 s."""
+def under(rain_mm_h, plants=0.0) -> torch.Tensor:
+    """Temperatures [P, F] in °C, with noise, of light bodies without a core that keep 0.3 mm of this rain [T] and, where they are
+    dry, evaporate the share ``plants``; steps of 20 s."""
     moments, generator = seen()[0], torch.Generator().manual_seed(4)
     takes, capacity = torch.rand(2, POINTS, generator=generator, dtype=torch.float64)
     takes, capacity = 0.3 + 0.6 * takes, 1e4 + 3e4 * capacity
@@ -75,7 +76,7 @@ def under(rain_mm_h) -> torch.Tensor:
         values.append(state)
         gap, covered = vapour_k(state, torch.full_like(state, 100.0)) - vapour, (film / COVERS_MM).clamp(max=1.0)
         heat = takes * light + 0.95 * STEFAN_BOLTZMANN * (sky_k**4 - state**4)
-        heat += EXCHANGE * (0.5 + 0.5 * wind) * (air - state - covered * gap)
+        heat += EXCHANGE * (0.5 + 0.5 * wind) * (air - state - (covered + (1.0 - covered) * plants) * gap)
         film = (film + 20.0 * (rain / 3600.0 - covered * dries * gap)).clamp(0.0, FILM_MM)
         state = state + 20.0 * heat / capacity
     at = np.rint((moments.numpy() - steps[0]) / 20.0)
@@ -168,6 +169,13 @@ def test_surfaces_that_rain_wets_are_told_from_those_under_a_roof(wet):
     dry = balance(weather=weather, values=under(showers if wet else 0.0 * showers))
     gain = compared(replace(dry, film_mm=FILM_MM).squares, dry.squares, dry.weights)
     assert gain.exceeds(0.5, 3.0) if wet else gain.sigmas < -2.0, gain
+
+
+@pytest.mark.parametrize("plants", [0.3, 0.0])
+def test_surfaces_that_transpire_are_told_from_dry_ones(plants):
+    dry = balance(values=under(torch.zeros_like(WEATHER.times_s), plants))
+    gain = compared(replace(dry, transpires=True).squares, dry.squares, dry.weights)
+    assert gain.exceeds(0.2, 3.0) if plants else gain.sigmas < 1.0, gain
 
 
 @pytest.mark.parametrize(("name", "least_db"), [("solar", 5.0), ("radiation", 1.0), ("convection", 0.3)])

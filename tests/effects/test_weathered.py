@@ -146,15 +146,13 @@ def test_rain_that_nobody_recorded_or_that_did_not_fall_wets_nothing():
         assert not replace(recorded(), weather=weather).rained
 
 
-@pytest.mark.parametrize(
-    ("rained", "bent", "tracks", "wet"),
-    [(True, True, True, True), (False, True, True, False), (True, False, True, False), (True, True, False, False)],
-)
-def test_where_rain_shows_surfaces_transpire_too_in_the_full_balance(monkeypatch, rained, bent, tracks, wet):
+@pytest.mark.parametrize(("bent", "tracks", "told"), [(True, True, True), (False, True, False), (True, False, False)])
+def test_water_is_told_to_a_balance_that_is_solved_as_it_stands(monkeypatch, bent, tracks, told):
     monkeypatch.setattr("heatsplat.effects.weathered.weather_record.bent", lambda obs: bent)
     obs = SimpleNamespace(tracks=object() if tracks else None)
-    seen = SimpleNamespace(weathered=SimpleNamespace(rained=rained), obs=obs)
-    assert water_on(seen) == {"rain": FILM_MM if wet else None, "transpires": wet}
+    for rained, transpires in ((True, True), (True, False), (False, True), (False, False)):
+        seen = SimpleNamespace(weathered=SimpleNamespace(rained=rained, transpires=transpires), obs=obs)
+        assert water_on(seen) == {"rain": FILM_MM if told and rained else None, "transpires": told and transpires}
     assert water_on(SimpleNamespace(weathered=None, obs=obs)) == {"rain": None, "transpires": False}
 
 

@@ -25,10 +25,11 @@ from heatsplat.physics.wetness import drying_mm_s_k, vapour_k
 
 # Of bodies with a core (``physics.marching.UNITS``): the limits of what has some, and what a number before its sigmoid, or as it
 # is, is expected to be, with a standard deviation. A surface starts about its own mean, a core about the mean of the air.
-LIMITS = {"share": (0.02, 0.98), "sun": (0.0, 200.0), "wind": (0.0, 0.95)}
+LIMITS = {"share": (0.02, 0.98), "sun": (0.0, 200.0), "wind": (0.0, 0.95), "transpires": (0.0, 1.0)}
 EXPECTED = {
     "start": (0.0, 10.0), "log_rate": (-math.log(3600.0), 1.5), "share": (-0.4, 1.0), "sun": (-2.2, 1.5), "wind": (-0.3, 1.0),
     "core_start": (0.0, 3.0), "core_log_rate": (-math.log(6 * 3600.0), 1.5), "log_coupling": (-0.7, 1.5),
+    "transpires": (-3.0, 1.0),
 }  # fmt: skip
 FIRST_S = (1200.0, 7200.0)  # time constants from which fits start
 STEPS, STEPS_ON = 12, 6  # of a fit, and of one that goes on from a fit to more observations
@@ -48,6 +49,7 @@ class FullBalance:
         values, errors, weights: [P, F] temperatures in °C, what errors are to be expected, and 0 where a point is not seen.
         normals: [P, 3] of the surface, or None: points lie level.
         film_mm: of the record's rain that stay on surfaces until they have evaporated; None: surfaces stay dry.
+        transpires: whether dry surfaces evaporate a share of what wet ones do, each its own.
     """
 
     weather: Weather
@@ -58,6 +60,7 @@ class FullBalance:
     weights: Tensor
     normals: Tensor | None
     film_mm: float | None = None
+    transpires: bool = False
 
     def without(self, name: str) -> FullBalance:
         """The same without "solar", "radiation" or "convection": in the dark, under a sky as warm as the air, or in a
@@ -112,6 +115,7 @@ class FullBalance:
             drivers["light"] = weather.irradiance_w_m2 / 1000.0
         if self.film_mm is not None:
             drivers |= {"rain": weather.rain_mm_h / 3600.0, "dries": drying_mm_s_k(weather)}
+        if self.film_mm is not None or self.transpires:
             drivers["vapour"] = vapour_k(kelvin(weather.air_c), weather.humidity_percent)
         up = weather.up.double() if "beams" in drivers else None
         series = {name: values[kept] for name, values in drivers.items()}
@@ -123,6 +127,7 @@ class FullBalance:
         drivers = self._climate.drivers
         absent = {"sun"} if drivers.light is None else set()
         absent |= {"wind"} if drivers.wind_anomaly is None else set()
+        absent |= set() if self.transpires else {"transpires"}
         return [name for name in EXPECTED if name not in absent]
 
     @cached_property
