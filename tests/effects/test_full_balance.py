@@ -139,6 +139,17 @@ def test_frames_in_any_order_and_a_long_record_before_them_change_nothing():
     assert len(since) == len(WEATHER.times_s) + 9
 
 
+def test_frames_of_one_moment_agree_and_those_beyond_the_record_are_at_its_ends():
+    whole, (first, last) = balance(), WEATHER.times_s[[0, -1]].tolist()
+    times = whole.times_s.clone()
+    times[3], times[0], times[1], times[-1], times[-2] = times[2], first, first - 5000.0, last, last + 30 * 86400.0
+    found = replace(whole, times_s=times)._temperatures(whole._expected)[0]
+    for one, other in ((2, 3), (0, 1), (-1, -2)):
+        assert torch.equal(found[:, one], found[:, other])
+    later = replace(whole, times_s=whole.times_s + 60 * 86400.0)._temperatures(whole._expected)[0]
+    assert torch.isfinite(later).all()
+
+
 @pytest.mark.parametrize("without", ["wind_m_s", "irradiance_w_m2"])
 def test_what_a_record_lacks_has_no_numbers(without):
     lacking = balance(weather=replace(WEATHER, **{without: None}))

@@ -102,7 +102,7 @@ class FullBalance:
     def _climate(self) -> Climate:
         weather = self.weather
         forgotten = int((weather.times_s < float(self.times_s.min()) - MEMORY_S).sum())
-        kept = slice(max(forgotten - 1, 0), None)
+        kept = slice(min(max(forgotten - 1, 0), len(weather.times_s) - 2), None)
         reference_k = float(kelvin(driver_means(weather.times_s, weather.air_c)))
         air = kelvin(weather.air_c) - reference_k
         drivers = {"air": air, "sky": power_excess(self.sky_k - reference_k, reference_k)}
@@ -155,8 +155,9 @@ class FullBalance:
         core = Core(found.pop("core_start"), found.pop("core_log_rate"), found.pop("log_coupling").exp())
         normals = None if self._climate.drivers.up is None else self.normals.double()
         surface = Surface(**{"sun": None} | found, normals=normals, core=core)
-        moments, order = self.times_s.sort()
-        marched = march(self._climate, surface, moments)[order.argsort()].transpose(0, 1)
+        record = self._climate.drivers.times_s  # beyond whose ends it says nothing
+        moments, places = self.times_s.clamp(record[0], record[-1]).unique(return_inverse=True)
+        marched = march(self._climate, surface, moments)[places].transpose(0, 1)
         return marched[..., 0], marched[..., 1:] * slopes[:, None]
 
     def _fitted(self, used: Tensor, starts: Sequence[Tensor], steps: int) -> tuple[Tensor, Tensor]:

@@ -83,7 +83,7 @@ def march(
     """Temperatures x of n surfaces at moments [F] of the record, with their derivatives by ``parameters`` behind: [F, n, 1 + Q].
 
     Args:
-        moments: [F] float64, increasing.
+        moments: [F] float64, strictly increasing.
         sensitive: with derivatives; otherwise [F, n, 1], of bodies with a core with y behind, and where it rains with the mm of
             water on them behind that.
         first: sample of the record at which surfaces and cores have their ``start``, and surfaces their ``film``.
