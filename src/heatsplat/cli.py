@@ -321,7 +321,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 
     from heatsplat.export.formats.base import checked_range
     from heatsplat.export.place import placed, unit_in_metres
-    from heatsplat.io.pictures import checked_colormap
+    from heatsplat.io.pictures import checked_colormap, checked_contours, checked_isotherm
     from heatsplat.io.video import CODECS, encoder
     from heatsplat.shots import (
         ShotFiles,
@@ -345,7 +345,12 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
         )
     listed = build(config["listed"])
     checked_range(config["range_c"], "range_c")
-    look = {"range_c": config["range_c"], "colormap": checked_colormap("colormap", config["colormap"])}
+    look = {
+        "range_c": config["range_c"],
+        "colormap": checked_colormap("colormap", config["colormap"]),
+        "isotherm": checked_isotherm("isotherm", config["isotherm"]),
+        "contours": checked_contours("contours", config["contours"]),
+    }
     check_numbers("fps", config["fps"], error=SceneError, above=0)
     names = [config["images"]] if isinstance(config["images"], str) else config["images"]
     if not isinstance(names, list) or not names:
