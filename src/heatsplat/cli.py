@@ -431,7 +431,7 @@ def export(config: dict[str, Any], output_dir: Path) -> None:
         SceneError: no format is chosen.
     """
     from heatsplat.export.files import write_files
-    from heatsplat.export.moment import LAYERS
+    from heatsplat.export.moment import LAYERS, checked_box
     from heatsplat.shots import checked_times
 
     if config.get("what") is None:
@@ -439,9 +439,13 @@ def export(config: dict[str, Any], output_dir: Path) -> None:
     check_option("layer", config["layer"], LAYERS, SceneError)
     if config["time"] is not None:
         checked_times(config["time"])
-    form = build(config["what"])
+    box, form = checked_box("box", config["box"]), build(config["what"])
+    if box is not None and not form.of_gaussians:
+        raise SceneError(
+            "box cuts Gaussians out for what=gltf, las, npz, ply and spz: a map has what.bounds, and a mesh is yours to cut"
+        )
     trained = _load(config, output_dir)
-    for path in write_files(trained.module, form, output_dir, config["time"], config["layer"]):
+    for path in write_files(trained.module, form, output_dir, config["time"], config["layer"], box):
         log.info("%s (%s)", path, size_told(path.stat().st_size))
 
 
