@@ -35,7 +35,7 @@ from heatsplat.datamodules.poses import MAX_COORDINATE
 from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, check_masks, image_notes, prepare
 from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
 from heatsplat.datamodules.side_files import finite
-from heatsplat.datamodules.splits import ALL, SplitRule
+from heatsplat.datamodules.splits import ALL, every_nth
 from heatsplat.datamodules.weather import weather_at_frame
 from heatsplat.datamodules.weather_table import FIRST_EPOCH_S, LAST_EPOCH_S
 from heatsplat.physics.defects import dead_pixels
@@ -96,7 +96,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
     raw = _with_checked_numbers(_without_bounds_of_photos(raw, notes))
     frames, times, time_notes = _in_order(raw.frames)
     notes |= time_notes
-    train, test, val = _split(frames, options.split, notes)
+    train, test, val = _split(frames, options, notes)
     first_s = times[train[0]] if times else None
     raw = _with_finite_points(raw, notes)
     raw = _with_weather_since(raw, first_s, notes)
@@ -189,11 +189,18 @@ def _with_checked_numbers(raw: RawScene) -> RawScene:
 
 
 def _split(
-    frames: Sequence[RawFrame], rule: SplitRule, notes: dict[str, Any]
+    frames: Sequence[RawFrame], options: SceneOptions, notes: dict[str, Any]
 ) -> tuple[list[int], list[int], list[int]]:
     """Positions of the training, test and validation frames, each in order."""
-    train, test = rule([f.name for f in frames], list(range(len(frames))), [f.subset for f in frames])
-    train, test = sorted(train), sorted(test)
+    rule, names = options.split, [f.name for f in frames]
+    train, test = rule(names, list(range(len(frames))), [f.subset for f in frames])
+    left_out = len(frames) - len(set(train) | set(test))
+    every_one, train, test = len(train), sorted(train)[:: options.every], sorted(test)
+    if options.every > 1:
+        notes["every"] = f"{len(train)} of {every_one}, by data.every={options.every}"
+        log.info("images for training: %s", notes["every"])
+        if rule.rule == ALL:
+            test = sorted(train[i] for i in every_nth([names[i] for i in train])[1])
     val = [test[i] for i in evenly_spread(len(test), MAX_VAL_VIEWS)]
     notes |= {
         "split": rule.rule,
@@ -204,13 +211,13 @@ def _split(
     if both := sorted(set(train) & set(test)):
         notes["split_in_both"] = f"{counted(len(both), 'test frame')} trained on, too: {FITTED}"
     if rule.rule == ALL:
-        log.info("data.split=all: every frame is for training; %s", notes["split_in_both"])
+        log.info("data.split=all: nothing is held out; %s", notes["split_in_both"])
     elif both:
         log.warning(
             "data.split=%s: training and test have %s in common (%s), so that scores flatter the run; name each in one list",
             rule.rule, counted(len(both), "frame"), ", ".join(frames[i].name for i in both[:3]) + ", ..." * (len(both) > 3),
         )  # fmt: skip
-    if left_out := len(frames) - len(set(train) | set(test)):
+    if left_out:
         notes["split_left_out"] = f"{counted(left_out, 'frame')} in neither list, not used"
     return train, test, val
 

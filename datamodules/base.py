@@ -45,6 +45,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         split_fraction: share of the frames that ``block`` holds out.
         split_position: where its stretch lies in time, 0 (start) to 1 (end).
         split_file: file of test names for ``list``, relative to the scene or the working directory.
+        every: of the training frames every so many-th is used (``SceneOptions``).
         seed: of the order of views, and of random points where a scene has none.
         thermal_channels: 1, or 3 for pseudo-colour without temperatures.
         masks: folder in the scene with a mask <image name>.png per image (COLMAP's rule), which need not be there; None for none.
@@ -68,6 +69,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         split_fraction: float = 0.125,
         split_position: float = 0.5,
         split_file: str | None = None,
+        every: int = 1,
         seed: int = 0,
         thermal_channels: int = 1,
         masks: str | None = MASKS,
@@ -84,6 +86,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         self.downscale = downscale
         folder = Path(root).expanduser() / (scene or "") if root else None
         self.split = SplitRule(split, split_fraction, split_position, split_file or None, folder)
+        self.every = every
         self.seed = seed
         self.thermal_channels = thermal_channels
         self.masks = masks
@@ -200,7 +203,9 @@ class SceneDataModule(pl.LightningDataModule, ABC):
     ) -> SceneData:
         """``build_scene`` of a ``RawScene`` with this module's options."""
         multiple = Reduction.parse(self.degrade).factor if self.degrade else 1
-        options = SceneOptions(split or self.split, self.downscale, self.thermal_channels, self.alpha_mask, multiple)
+        options = SceneOptions(
+            split or self.split, self.downscale, self.thermal_channels, self.alpha_mask, multiple, self.every
+        )
         return build_scene(RawScene(name, frames, points, **scene), options)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from heatsplat.contracts import Environment, SceneError, ThermalRange, Weather
+from heatsplat.contracts import Environment, SceneError, ThermalRange, Weather, check_count
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.poses import checked_pose
 from heatsplat.datamodules.splits import SplitRule
@@ -116,6 +116,8 @@ class SceneOptions:
         thermal_channels: 1, or 3 to keep pseudo-colour (which has no temperature: the range is dropped).
         alpha_mask: True to leave out pixels whose alpha is below one half; otherwise alpha is ignored.
         multiple: of which sides of images are that shrink, as close to W / d and H / d as that allows; 1 for any.
+        every: of the training frames every so many-th is used, in the order of their times (of names without), the first one
+            included; test frames are those of ``split``, or where it holds nothing out, some of the frames used.
     """
 
     split: SplitRule
@@ -123,8 +125,10 @@ class SceneOptions:
     thermal_channels: int = 1
     alpha_mask: bool = False
     multiple: int = 1
+    every: int = 1
 
     def __post_init__(self) -> None:
+        check_count("data.every", self.every)
         if not self.downscale >= 1:
             raise SceneError(f"data.downscale must be 1 or larger, got {self.downscale}")
         if self.thermal_channels not in (1, 3):

@@ -29,7 +29,7 @@ from heatsplat.doctor.base import MAX_FRAMES, Finding, Material, material_of
 from heatsplat.doctor.examination import FINDINGS_FILE, examine, show, warn, write_findings
 from heatsplat.preparation.devices import Device, devices_of
 from heatsplat.preparation.frame import ThermalFrame
-from heatsplat.preparation.frames import Reading, read_recording, reading_of
+from heatsplat.preparation.frames import Reading, Recording, read_recording, reading_of
 from heatsplat.preparation.makers import taken_at
 from heatsplat.preparation.report import Section
 
@@ -96,9 +96,10 @@ def check(
     return found
 
 
-def section(folder: Path, reading: Reading | None = None) -> Section:
-    """The part of a preparation's report on what is wrong with a folder, which is warned of, too."""
-    materials, _ = materials_in(folder, 1.0, reading)
+def section(folder: Path, reading: Reading | None = None, recording: Recording | None = None) -> Section:
+    """The part of a preparation's report on what is wrong with a folder, which is warned of, too; arguments as of
+    ``materials_in``."""
+    materials, _ = materials_in(folder, 1.0, reading, recording)
     posed, found = any(material.cameras is not None for material in materials.values()), examined(materials)
     if not posed:
         found = [replace(one, remedy=DONE.get(one.check, one.remedy)) for one in found]
@@ -116,10 +117,10 @@ def _more_with_cameras(materials: Mapping[str, Material], found: Sequence[Findin
 
 
 def materials_in(
-    folder: Path, downscale: float = 1.0, reading: Reading | None = None
+    folder: Path, downscale: float = 1.0, reading: Reading | None = None, recording: Recording | None = None
 ) -> tuple[dict[str, Material], list[str]]:
     """What there is to look at in a folder: a scene, called "", or the files of each thermal camera by its label; and what was
-    taken for granted when the files were read.
+    taken for granted when the files were read; ``recording`` are these files where they have been read.
 
     Raises:
         SceneError: the folder holds neither scene nor recording.
@@ -133,7 +134,7 @@ def materials_in(
             f"{folder} holds {counted(len(scenes), 'scene')} of the protocol: give one, such as {scenes[0]}"
         )
     reading = reading or Reading()
-    recording = read_recording(folder, reading)
+    recording = recording or read_recording(folder, reading)
     devices = devices_of(recording.frames)
     notes = [f"{counted(len(device.frames), 'frame')} of {device.label}" for device in devices]
     return {device.label: _recorded(device, reading.zone) for device in devices}, [*notes, *recording.notes]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from heatsplat.contracts import SceneError, check_count, counted, evenly_spread
+from heatsplat.contracts import SceneError, check_count, check_option, counted, evenly_spread
 from heatsplat.datamodules.formats import dji, flir
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import (
@@ -36,6 +36,7 @@ from heatsplat.preparation.devices import devices_of, listed
 from heatsplat.preparation.frame import ThermalFrame, frame_name
 from heatsplat.preparation.makers import RECORDS, exif_details, radiometric_frames
 from heatsplat.preparation.meaning import Meaning
+from heatsplat.preparation.sharpness import sharpest
 from heatsplat.preparation.table import with_table
 
 # What makers and people put into names to tell the modalities of one exposure apart.
@@ -64,9 +65,10 @@ class Reading:
         table: file with a row for each frame, or None.
         columns: its columns: name, time, latitude_deg, longitude_deg, altitude_m, above_takeoff_m, yaw_deg, pitch_deg, roll_deg.
         every: of each camera every so many-th frame is taken, the first one included.
+        sharpest: of each camera the sharpest of each ``every`` frames in a row is taken instead.
 
     Raises:
-        SceneError: ``every`` is no whole number from 1 on.
+        SceneError: ``every`` is no whole number from 1 on, or 1 where the sharpest is to be taken.
     """
 
     meaning: Meaning = field(default_factory=Meaning)
@@ -74,9 +76,15 @@ class Reading:
     table: Path | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
     every: int = 1
+    sharpest: bool = False
 
     def __post_init__(self) -> None:
         check_count("every", self.every)
+        check_option("sharpest", self.sharpest, (True, False), SceneError)
+        if self.sharpest and self.every == 1:
+            raise SceneError(
+                "sharpest=true changes nothing with every=1: give every=15, say, for the sharpest of each 15 frames"
+            )
 
 
 def reading_of(
@@ -88,10 +96,12 @@ def reading_of(
     table: str | None = None,
     table_columns: Mapping[str, str] | None = None,
     every: int = 1,
+    sharpest: bool = False,
 ) -> Reading:
     """How a folder is read, from settings of a command: ``counts``, ``bounds_c`` and ``band_um`` are of ``Meaning``."""
     meaning = Meaning(**(counts or {}), bounds_c=bounds_c, band_um=band_um)
-    return Reading(meaning, zone, Path(table).expanduser() if table else None, table_columns or {}, every)
+    place = Path(table).expanduser() if table else None
+    return Reading(meaning, zone, place, table_columns or {}, every, sharpest)
 
 
 @dataclass(frozen=True)
@@ -125,7 +135,14 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     frames = _without_fixes_of_earlier_places([_zoned(frame, reading.zone) for frame in frames], notes)
     _check_names(frames)
     frames = _in_order(frames, notes)
-    if reading.every > 1:
+    if reading.sharpest:
+        kept, gained = sharpest(frames, reading.every)
+        notes.append(
+            f"every={reading.every} sharpest=true takes {len(kept)} of {counted(len(frames), 'frame')}, the sharpest of each "
+            f"{reading.every}: {gained}"
+        )
+        frames = kept
+    elif reading.every > 1:
         taken = {frame.name for device in devices_of(frames) for frame in device.frames[:: reading.every]}
         notes.append(f"every={reading.every} takes {len(taken)} of {counted(len(frames), 'frame')}")
         frames = [frame for frame in frames if frame.name in taken]

@@ -17,7 +17,7 @@ from heatsplat.preparation import report
 from heatsplat.preparation.conditions import GivenConditions, InputUncertainty
 from heatsplat.preparation.devices import devices_of, listed
 from heatsplat.preparation.frame import ThermalFrame
-from heatsplat.preparation.frames import Reading, read_recording, reading_of
+from heatsplat.preparation.frames import Reading, Recording, read_recording, reading_of
 from heatsplat.preparation.report import Section
 from heatsplat.preparation.target import PREPARED, Target
 from heatsplat.preparation.writer import Writer
@@ -26,8 +26,9 @@ log = logging.getLogger(__name__)
 
 # How cameras are found: gets the frames and the prepared folder, whose images/ has a file for each frame, and writes sparse/0.
 Poses = Callable[[list[ThermalFrame], Path], Section]
-# What is wrong with the files of a folder (prepared or not), read as they are here, the most costly first.
-Doctor = Callable[[Path, Reading], Section]
+# What is wrong with the files of a folder (prepared or not), read as they are here, the most costly first; the frames in it where
+# they have been read.
+Doctor = Callable[[Path, Reading, Recording | None], Section]
 
 
 def prepare(
@@ -43,6 +44,7 @@ def prepare(
     table: str | None = None,
     table_columns: Mapping[str, str] | None = None,
     every: int = 1,
+    sharpest: bool = False,
     keep_counts: bool = False,
     doctor: Doctor | None = None,
     poses: Poses | None = None,
@@ -60,7 +62,7 @@ def prepare(
         uncertainty: arguments of ``InputUncertainty``.
         counts: ``scale``, ``offset_c`` and ``planck`` of ``Meaning``.
         bounds_c, band_um: of ``Meaning``.
-        zone, table, table_columns, every: of ``Reading``.
+        zone, table, table_columns, every, sharpest: of ``Reading``.
         keep_counts: also write the numbers as the camera stored them.
         doctor: looks at the folder first, and at the scene once it has cameras, or None.
         poses: finds the cameras, or None.
@@ -84,6 +86,7 @@ def prepare(
         table=table,
         table_columns=table_columns,
         every=every,
+        sharpest=sharpest,
     )
     found = read_recording(folder, reading)
     for note in found.notes:
@@ -92,7 +95,7 @@ def prepare(
         log.warning(
             "%d thermal cameras, each with a lens and dead pixels of its own: %s", len(devices), listed(devices)
         )
-    sections = [doctor(folder, reading)] if doctor else []
+    sections = [doctor(folder, reading, found)] if doctor else []
     frames = [given.settled(frame) for frame in found.frames]
     given.check_use(frames)
     writer = Writer(target, uncertain, keep_counts)
@@ -121,7 +124,7 @@ def prepare(
         for finding in section.findings:
             log.warning("%s", finding)
     if poses:
-        sections += _cameras(poses, partial(doctor, target, reading) if doctor else None, frames, place, sections)
+        sections += _cameras(poses, partial(doctor, target, reading, None) if doctor else None, frames, place, sections)
     page = report.write_report(target, sections)
     log.info("%s", page.with_suffix(".html"))
     return page

@@ -214,6 +214,26 @@ def test_pictures_have_the_colours_that_were_asked_for(tmp_path):
     assert np.ptp(shown["gray"], axis=2).max() == 0 and np.ptp(shown["inferno"], axis=2).max() > 50
 
 
+def test_isotherms_and_contours_are_drawn_into_temperatures_alone(tmp_path, monkeypatch):
+    scene = make_scene()
+    (frame,) = shot_frames(scene, "view", 0.0, 0, 1)
+    image = torch.linspace(0.0, 1.0, frame.camera.width).expand(frame.camera.height, -1)[..., None]
+    shown = []
+    monkeypatch.setattr(
+        "heatsplat.shots.compose", lambda panels, title: shown.extend(panels) or np.zeros((4, 4, 3), np.uint8)
+    )
+    beside = depth_beside(scene, lambda frame: torch.ones(frame.camera.height, frame.camera.width), [frame], None)
+    images = [({"recorded": image, "rgb": image.expand(-1, -1, 3)}, None)]
+    middle = scene.thermal_range.to_celsius(0.5)
+    look = {"isotherm": (middle, np.inf), "contours": [middle]}
+    write_shot(images, [frame], scene, ShotFiles(tmp_path, video=False), beside=[beside], **look)
+    temperature, colour, depth = shown
+    assert "green: 50.0 % above" in temperature.title and [level for level, _ in temperature.lines] == [middle]
+    assert colour.title == "rgb" and "green" not in depth.title and not colour.lines and not depth.lines
+    with pytest.raises(SceneError, match="contours=1e-09 draws more than 50 lines"):
+        write_shot(iter(()), [frame], scene, ShotFiles(tmp_path / "b"), contours=1e-9)
+
+
 def test_a_figure_names_the_view_its_moment_and_the_clock(tmp_path):
     scene = make_scene()
     weather = replace(scene.weather, notes={"utc_at_zero_s": 1722965689.0})

@@ -321,7 +321,7 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
 
     from heatsplat.export.formats.base import checked_range
     from heatsplat.export.place import placed, unit_in_metres
-    from heatsplat.io.pictures import checked_colormap
+    from heatsplat.io.pictures import checked_colormap, checked_contours, checked_isotherm
     from heatsplat.io.video import CODECS, encoder
     from heatsplat.shots import (
         ShotFiles,
@@ -345,7 +345,12 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
         )
     listed = build(config["listed"])
     checked_range(config["range_c"], "range_c")
-    look = {"range_c": config["range_c"], "colormap": checked_colormap("colormap", config["colormap"])}
+    look = {
+        "range_c": config["range_c"],
+        "colormap": checked_colormap("colormap", config["colormap"]),
+        "isotherm": checked_isotherm("isotherm", config["isotherm"]),
+        "contours": checked_contours("contours", config["contours"]),
+    }
     check_numbers("fps", config["fps"], error=SceneError, above=0)
     names = [config["images"]] if isinstance(config["images"], str) else config["images"]
     if not isinstance(names, list) or not names:
@@ -426,7 +431,7 @@ def export(config: dict[str, Any], output_dir: Path) -> None:
         SceneError: no format is chosen.
     """
     from heatsplat.export.files import write_files
-    from heatsplat.export.moment import LAYERS
+    from heatsplat.export.moment import LAYERS, checked_box
     from heatsplat.shots import checked_times
 
     if config.get("what") is None:
@@ -434,9 +439,13 @@ def export(config: dict[str, Any], output_dir: Path) -> None:
     check_option("layer", config["layer"], LAYERS, SceneError)
     if config["time"] is not None:
         checked_times(config["time"])
-    form = build(config["what"])
+    box, form = checked_box("box", config["box"]), build(config["what"])
+    if box is not None and not form.of_gaussians:
+        raise SceneError(
+            "box cuts Gaussians out for what=gltf, las, npz, ply and spz: a map has what.bounds, and a mesh is yours to cut"
+        )
     trained = _load(config, output_dir)
-    for path in write_files(trained.module, form, output_dir, config["time"], config["layer"]):
+    for path in write_files(trained.module, form, output_dir, config["time"], config["layer"], box):
         log.info("%s (%s)", path, size_told(path.stat().st_size))
 
 

@@ -397,6 +397,8 @@ def write_shot(
     titles: Mapping[str, str] | None = None,
     beside: Sequence[Beside] = (),
     colormap: str = THERMAL,
+    isotherm: tuple[float, float] | None = None,
+    contours: float | Sequence[float] | None = None,
 ) -> list[Path]:
     """Paths of the files written for a shot: TIFF in °C, PNG with a bar, a video of each image, and ``frames.csv``.
 
@@ -420,12 +422,17 @@ def write_shot(
         titles: of images in pictures, by name; others have their name.
         beside: what else is written of each frame.
         colormap: name of the matplotlib map that colours temperatures (``io.pictures.checked_colormap``).
+        isotherm, contours: in pictures of temperatures (``io.pictures.Bar``), in °C.
+
+    Raises:
+        SceneError: more contour lines than a picture shows, before an image is taken.
     """
     bounds = scene.thermal_range
     if bounds is None:
         log.warning("scene '%s' has no temperature bounds: files hold image values in [0, 1], not °C", scene.name)
     low, high = range_c or ((bounds.min_c, bounds.max_c) if bounds else (0.0, 1.0))
-    bar = Bar(low, high, bar_unit(bounds), colormap)
+    bar = Bar(low, high, bar_unit(bounds), colormap, isotherm=isotherm, contours=contours)
+    bar.levels()  # too many are refused before anything is rendered
     stems = file_stems([frame.name for frame in frames])
     clock = clock_of(scene)
     rows: list[tuple[str, float | None, float, float]] = []

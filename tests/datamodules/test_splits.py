@@ -32,6 +32,28 @@ def test_all_trains_on_every_frame_and_says_what_scores_then_tell(tmp_path, capl
     assert not any(record.levelname == "WARNING" for record in caplog.records)
 
 
+def test_every_so_many_th_training_frame_is_used_and_what_is_held_out_stays(tmp_path):
+    files = names(21)
+    write_colmap(tmp_path, files)
+    whole, few = (Colmap(root=str(tmp_path), every=every).scene for every in (1, 3))
+    named = [[frame.name for frame in views.frames] for views in (whole.train, few.train, whole.test, few.test)]
+    assert named[1] == named[0][::3] and named[2] == named[3]
+    assert "every" not in whole.notes and few.notes["every"] == "6 of 18, by data.every=3"
+    assert few.notes["train_views"] == 6 and "split_left_out" not in few.notes
+    shared = {frame.name: frame.frame_id for frame in whole.frames}
+    assert all(shared[frame.name] == frame.frame_id for frame in few.frames)
+    with pytest.raises(SceneError, match="data.every must be a whole number, 1 or more, got 0"):
+        _ = Colmap(root=str(tmp_path), every=0).scene
+
+
+def test_where_nothing_is_held_out_test_frames_are_some_of_those_used(tmp_path):
+    write_colmap(tmp_path, files := names(21))
+    scene = Colmap(root=str(tmp_path), split="all", every=2).scene
+    used, tested = ([frame.name for frame in views.frames] for views in (scene.train, scene.test))
+    assert used == files[::2] and tested == used[::8]
+    assert scene.notes["split_in_both"] == "2 test frames trained on, too: " + FITTED
+
+
 def test_quarter_centre_takes_the_middle_eighth_of_each_quarter():
     _, test = quarter_centre(range(221))
     # quarters of 55, 55, 55 and 56 frames: 6, 6, 6 and 7 test frames from (55 - 6) // 2 = 24 and (56 - 7) // 2 = 24 on

@@ -1,13 +1,14 @@
 """The Gaussians at a moment: what they are and what is refused."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from heatsplat.contracts import SceneError
 from heatsplat.export.basis import constant_basis
-from heatsplat.export.moment import moments
+from heatsplat.export.moment import checked_box, inside, moments
 from heatsplat.shots import at_time
 
 
@@ -66,3 +67,54 @@ def test_nothing_is_beyond_the_range_of_images_where_values_are_clipped(cooling,
     found = moments(cooling.module, replace(cooling.seen, layers=[beyond]), 600.0, layer)[0]
     low, high = cooling.seen.limits
     assert found.values.tolist() == pytest.approx([low, 0.5 * (low + high), high], abs=0.01)
+
+
+def test_a_box_cuts_out_gaussians_in_the_coordinates_of_the_data_set(cooling):
+    scene = replace(cooling.module.scene, notes={**cooling.module.scene.notes, "origin": [1000.0, 0.0, -50.0]})
+    moved = replace(cooling, module=SimpleNamespace(scene=scene, renderer=cooling.module.renderer))
+    high, low = cooling.seen.means.quantile(0.7, dim=0).double(), cooling.seen.means.quantile(0.2, dim=0).double()
+    box = checked_box("box", [(high + scene.origin).tolist(), (low + scene.origin).tolist()])
+    cut = inside(moved, box)
+    kept = ((cooling.seen.means >= low) & (cooling.seen.means <= high)).all(1)
+    assert 0 < kept.sum() < len(kept)
+    for name in ("means", "quats", "scales", "opacities"):
+        assert torch.equal(getattr(cut.seen, name), getattr(cooling.seen, name)[kept])
+    assert torch.equal(cut.values, cooling.values[kept]) and cut.quantity == cooling.quantity
+    (lasting,) = moments(cooling.module, cut.seen, 600.0)  # its curves over time are those of these Gaussians
+    assert torch.equal(lasting.values, cut.values) and torch.equal(
+        cut.layer.basis.at(600.0), lasting.layer.basis.at(600.0)
+    )
+    for name, values in cooling.seen.attributes.items():
+        assert torch.equal(cut.seen.attributes[name].nan_to_num(-1), values[kept].nan_to_num(-1))
+
+
+def test_cameras_see_what_a_box_leaves_out(cooling):
+    view = cooling.module.scene.train[0]
+    nearest = cooling.seen.means[(view.camera.project(cooling.seen.means)[1]).argmin()].double()
+    cut = inside(cooling, torch.stack([nearest - 0.01, nearest + 0.01]))
+    assert len(cut.values) < len(cooling.values)
+    assert torch.equal(cut.look(view).depth, cooling.look(view).depth)
+
+
+def test_a_box_without_gaussians_says_where_they_lie(cooling):
+    with pytest.raises(
+        SceneError, match=r"holds none of the \d+ Gaussians, which lie between \[.*\] and \[.*\] \(98 %"
+    ):
+        inside(cooling, torch.tensor([[500.0, 0, 0], [501.0, 1, 1]], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("box", "told"),
+    [
+        ([0, 0, 0, 1, 1, 1], "must be two opposite corners"),
+        ([[0, 0, 0]], "must be two opposite corners"),
+        ([[0, 0], [1, 1]], "must be two opposite corners"),
+        ([[0, 0, "a"], [1, 1, 1]], "must be two opposite corners"),
+        ([[0, 0, float("nan")], [1, 1, 1]], "must be two opposite corners"),
+        ([[0, 0, 0], [1, 0, 1]], "has no volume: its corners must differ in x, y and z"),
+    ],
+)
+def test_what_is_no_box_is_refused(box, told):
+    with pytest.raises(SceneError, match=f"box.*{told}"):
+        checked_box("box", box)
+    assert checked_box("box", None) is None

@@ -11,13 +11,17 @@ import pytest
 import torch
 from PIL import Image
 
-from heatsplat.contracts import ThermalRange
+from heatsplat.contracts import SceneError, ThermalRange
 from heatsplat.io.pictures import (
+    BAR,
     GAP,
+    MARKED,
     UNKNOWN,
     Bar,
     Panel,
     _ticks,
+    checked_contours,
+    checked_isotherm,
     colorize,
     comparison_panels,
     compose,
@@ -161,6 +165,62 @@ def test_a_bar_has_arrows_where_values_lie_beyond_its_ends():
     assert plain.shape == arrowed.shape and (plain != arrowed).any()  # frames of a video keep their size
     middle = len(plain) // 2
     assert (plain[middle:] == arrowed[middle:]).all()  # the lower end is as it was
+
+
+def test_an_isotherm_is_green_in_the_picture_and_at_the_bar_and_its_share_is_told():
+    values = np.linspace(0.0, 10.0, 200).reshape(10, 20)
+    values[0, 0] = np.nan
+    for given, words, share in (
+        ([8.0, None], "above 8 °C", (values >= 8).sum() / 199),
+        ([None, -2.5], "below −2.5 °C", 0.0),
+        ([2, 3], "between 2 and 3 °C", ((values >= 2) & (values <= 3)).sum() / 199),
+    ):
+        bar = Bar(0.0, 10.0, "°C", isotherm=checked_isotherm("isotherm", given))
+        panel = image_panel(torch.from_numpy(values)[..., None], "x", bar)
+        assert panel.title == f"x · green: {100 * share:.1f} % {words}"
+        green = (panel.image == MARKED).all(-1)
+        assert green.sum() == round(199 * share)
+        plain = image_panel(torch.from_numpy(values)[..., None], "x", Bar(0.0, 10.0, "°C"))
+        assert (panel.image[~green] == plain.image[~green]).all()
+        barred = (compose([Panel(plain.image, "", bar)]) == MARKED).all(-1)
+        assert set(barred.sum(1)) == ({0, BAR} if share else {0})  # the bar alone
+
+
+def test_contour_lines_run_where_the_value_is_and_end_where_none_is_known(tmp_path):
+    values = np.add.outer(np.zeros(20), np.linspace(0.0, 11.6, 30))  # 0.4 a column
+    values[15:] = np.nan
+    bar = Bar(1.0, 9.0, "°C", contours=4.0)
+    panel = image_panel(torch.from_numpy(values)[..., None], "x", bar)
+    assert bar.levels() == [4.0, 8.0] and [level for level, _ in panel.lines] == [4.0, 8.0]
+    for level, line in panel.lines:
+        np.testing.assert_allclose(line[:, 0], level / 0.4)
+        assert line[:, 1].min() == 0 and line[:, 1].max() == 14
+    picture, plain = compose([panel]), compose([replace(panel, lines=[], bar=replace(bar, contours=None))])
+    changed = np.nonzero((picture != plain).any(-1)[GAP + 60])[0]
+    factor = 13  # of 20 x 30 pixels
+    middles = {round(GAP + (level / 0.4 + 0.5) * factor - 0.5) for level in bar.levels()}
+    assert middles <= set(changed[changed < GAP + 30 * factor].tolist()) and len(changed) < 2 * 6 + 10
+    write_figure(tmp_path / "p.svg", [panel])
+    assert (tmp_path / "p.svg").read_text().count("#ffffff") > 4
+    few = replace(bar, contours=[20.0, 5.0, 5.0])
+    assert few.levels() == [5.0, 20.0]
+    assert [level for level, _ in image_panel(torch.from_numpy(values)[..., None], "x", few).lines] == [5.0]
+    assert image_panel(torch.full((5, 5, 1), torch.nan), "x", few).lines == []
+    with pytest.raises(SceneError, match="contours=0.1 draws more than 50 lines between 1 and 9 °C: give 0.2 or more"):
+        replace(bar, contours=0.1).levels()
+
+
+def test_isotherms_and_contours_that_are_none_are_refused_with_the_option():
+    for wrong in (30, [30], [30, 20], [20, 20], [None, None], ["20", 30], [float("nan"), 3], "ab", {}):
+        with pytest.raises(
+            SceneError, match=r"isotherm must be \[low, high\] of rising numbers, \[low, null\] for all above"
+        ):
+            checked_isotherm("isotherm", wrong)
+    for wrong in (0, -1, "5", [], [20, None], True, float("inf")):
+        with pytest.raises(SceneError, match="contours must be a distance above 0, such as 5, or a list of values"):
+            checked_contours("contours", wrong)
+    assert checked_isotherm("isotherm", None) is checked_contours("contours", None) is None
+    assert checked_contours("contours", [20, 25.5]) == [20, 25.5]
 
 
 def test_panels_are_laid_out_in_rows():

@@ -146,8 +146,9 @@ def test_frames_without_cameras_keep_their_temperatures_and_the_page_says_why(tm
 def test_the_doctor_comes_first_and_sees_the_source(tmp_path):
     seen = []
 
-    def doctor(folder, reading):
+    def doctor(folder, reading, recording):
         seen.append(folder)
+        assert len(recording.frames) == 2  # as they were read
         return Section("Findings", ["none"])
 
     source = write_flir(tmp_path / "files", 2)

@@ -40,6 +40,7 @@ DATA_WORDS: Words = {
     "effects": ("effects in the scene", ""),
     "probes": ("points whose temperature is known", ""),
     "split": ("test images are chosen by", ""),
+    "every": ("images taken for training", ""),
     "split_in_both": ("images in training and test", ""),
     "val_views": ("validation images", ""),
     "pixel_type": ("numbers in the image files", ""),

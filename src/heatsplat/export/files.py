@@ -6,15 +6,19 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from heatsplat.export.formats.base import Format
-from heatsplat.export.moment import Moment, moments, moments_in
+from heatsplat.export.moment import Moment, inside, moments, moments_in
 from heatsplat.export.snapshot import snapshot, span_of
 from heatsplat.shots import Times
 
 log = logging.getLogger("heatsplat")
 
 
-def write_files(module: Any, form: Format, folder: Path, times: Times | None = None, layer: str = "auto") -> list[Path]:
+def write_files(
+    module: Any, form: Format, folder: Path, times: Times | None = None, layer: str = "auto", box: Tensor | None = None
+) -> list[Path]:
     """Paths of the files written, ``<scene>_<seconds>s<suffix>``; what they do not hold is warned of.
 
     Args:
@@ -23,12 +27,16 @@ def write_files(module: Any, form: Format, folder: Path, times: Times | None = N
         folder: of the files; it is made.
         times: seconds since the first training frame, or date-times, one or several; None takes ``SceneData.middle_s``.
         layer: as in ``export.moment.moments``.
+        box: outside of which Gaussians are left out (``export.moment.checked_box``); None leaves out none.
 
     Raises:
         SceneError: the scene lacks what was asked for.
         ImportError: a package of the extra "export" is missing.
     """
     found = _moments(module, form, times, layer)
+    if box is not None:
+        found = [inside(moment, box) for moment in found]
+        log.info("%d of %d Gaussians lie in the box", len(found[0].values), len(found[0].whole.values))
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for moment in found:

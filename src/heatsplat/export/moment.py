@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, SceneError, View, check_option
+from heatsplat.contracts import SceneData, SceneError, View, check_option, is_number, quantile
 from heatsplat.export.snapshot import Layer, Snapshot
 from heatsplat.geometry.coverage import OPEN, surface_depth
 from heatsplat.geometry.looks import Look
@@ -28,6 +28,7 @@ class Moment:
         blended: [N] values of the layer as renderers blend them.
         values: [N] the same in the unit of the scene: °C, or image values where these are no temperatures.
         module: the training module, for formats that render.
+        whole: the moment that these Gaussians were cut out of, which is what cameras see; None of all of them.
     """
 
     seen: Snapshot
@@ -36,6 +37,7 @@ class Moment:
     blended: Tensor
     values: Tensor
     module: Any
+    whole: Moment | None = None
 
     @property
     def quantity(self) -> str:
@@ -55,6 +57,8 @@ class Moment:
     def look(self, view: View) -> Look:
         """The values as the camera of a view sees them; NaN where it sees no surface, and where its mask leaves out what it sees:
         nothing of its image told what is there."""
+        if self.whole is not None:
+            return self.whole.look(view)
         seen, frame = self.seen, view.frame
         shapes = seen.means, seen.quats, seen.scales, seen.opacities[None]
         output = self.module.renderer.values_seen(shapes, self.blended[:, None], frame.camera, depth=True)
@@ -62,6 +66,43 @@ class Moment:
         known = alpha >= OPEN if view.mask is None else (alpha >= OPEN) & view.mask.to(alpha.device)
         means = (output.features[..., 0] / alpha).where(known, torch.nan)
         return Look(frame.camera, surface_depth(output.depth, alpha), self.of_blended(means))
+
+
+def checked_box(name: str, box: Any) -> Tensor | None:
+    """Lower and upper corner [2, 3] float64 of a box that two opposite corners span; None stays. Raises SceneError with the
+    option's ``name`` where they are not two places, or span none."""
+    if box is None:
+        return None
+    places = (
+        isinstance(box, list) and len(box) == 2 and all(isinstance(corner, list) and len(corner) == 3 for corner in box)
+    )
+    if not places or not all(is_number(x) for corner in box for x in corner):
+        raise SceneError(f"{name} must be two opposite corners [[x, y, z], [x, y, z]], got {box}")
+    low, high = torch.tensor(box, dtype=torch.float64).sort(dim=0).values
+    if not bool((low < high).all()):
+        raise SceneError(f"{name}={box} has no volume: its corners must differ in x, y and z")
+    return torch.stack([low, high])
+
+
+def inside(moment: Moment, box: Tensor) -> Moment:
+    """The Gaussians whose centres lie in a box [2, 3] in the coordinates of the data set.
+
+    Raises:
+        SceneError: there are none; the message says where they lie.
+    """
+    places = moment.seen.means.double() + moment.module.scene.origin
+    kept = ((places >= box[0]) & (places <= box[1])).all(1)
+    if not kept.any():
+        ends = [
+            ", ".join(f"{x:.6g}" for x in end) for end in quantile(places, places.new_tensor((0.01, 0.99))).tolist()
+        ]
+        raise SceneError(
+            f"box={box.tolist()} holds none of the {len(kept)} Gaussians, which lie between [{ends[0]}] and [{ends[1]}] (98 % of "
+            "them along each axis, in the coordinates of the data set)"
+        )
+    cut = {"seen": moment.seen.of(kept), "blended": moment.blended[kept], "values": moment.values[kept]}
+    layer = next(one for one in cut["seen"].layers if one.name == moment.layer.name)
+    return replace(moment, layer=layer, whole=moment, **cut)
 
 
 def moments_in(scene: SceneData, span: tuple[float, float] | None, times: Times | None) -> list[float | None]:

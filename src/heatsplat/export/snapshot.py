@@ -96,6 +96,23 @@ class Snapshot:
         """The two ends of the time that it covers; None without times."""
         return None if self.start_s is None else (self.start_s, self.end_s)
 
+    def of(self, kept: Tensor) -> Snapshot:
+        """The same of some of its Gaussians [N] bool."""
+
+        def rows(values: Tensor | None) -> Tensor | None:
+            return None if values is None else values[kept]
+
+        bases = [layer.basis for layer in self.layers]
+        bases = [replace(one, offsets=one.offsets[kept], coefficients=one.coefficients[kept]) for one in bases]
+        return replace(
+            self,
+            **{name: getattr(self, name)[kept] for name in ("means", "quats", "scales", "opacities")},
+            layers=[replace(layer, basis=basis) for layer, basis in zip(self.layers, bases, strict=True)],
+            colours=rows(self.colours),
+            colour_opacities=rows(self.colour_opacities),
+            attributes={name: values[kept] for name, values in self.attributes.items()},
+        )
+
 
 @torch.no_grad()
 def snapshot(module: Any) -> Snapshot:

@@ -20,12 +20,12 @@ import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw, ImageFont
 
-from heatsplat.contracts import SceneError, ThermalRange
+from heatsplat.contracts import SceneError, ThermalRange, is_number
 
 THERMAL = "inferno"
 ERROR = "RdBu_r"  # red: rendered too warm, blue: too cold
@@ -44,6 +44,9 @@ PANEL_HEIGHT = 260  # small images are enlarged by a whole factor to about this 
 WIDEST_PANEL = 1040  # and to about this width at most
 MARKS = "os^Dv<>P"  # of matplotlib, for many series in one figure
 TOLD_BEYOND = 0.05  # share of an image beyond an end of its bar from which the title says so
+MARKED = (26, 217, 115)  # of an isotherm, in no colour map; as viewer.html has it
+MOST_CONTOURS = 50  # at equal distances between the ends of a bar
+LABELLED = 60  # pixels of a contour line from which on its value stands at it
 FIGURE_PANEL = 1.8  # inches of height of an image in print
 
 
@@ -61,6 +64,32 @@ def checked_colormap(name: str, value: str) -> str:
     return value
 
 
+def checked_isotherm(name: str, value: Any) -> tuple[float, float] | None:
+    """The ends of an isotherm, of which one may be None and becomes infinite; None stays. Raises SceneError with the option's
+    ``name`` for anything else."""
+    if value is None:
+        return None
+    ends = value if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 2 else (None, None)
+    low, high = (open_end if end is None else end for open_end, end in zip((-np.inf, np.inf), ends, strict=True))
+    if not all(end is None or is_number(end) for end in ends) or not low < high or low == -high == -np.inf:
+        raise SceneError(
+            f"{name} must be [low, high] of rising numbers, [low, null] for all above, or [null, high] for all below; got {value}"
+        )
+    return float(low), float(high)
+
+
+def checked_contours(name: str, value: Any) -> float | list[float] | None:
+    """A positive distance of contour lines, or a list of their values; None stays. Raises SceneError with the option's ``name``
+    for anything else."""
+    if value is None or (isinstance(value, list) and value and all(map(is_number, value))):
+        return value
+    if not (is_number(value) and value > 0):
+        raise SceneError(
+            f"{name} must be a distance above 0, such as 5, or a list of values, such as [20, 25], got {value}"
+        )
+    return value
+
+
 @cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
     """The font that matplotlib ships, which has the degree sign."""
@@ -72,6 +101,10 @@ class Bar:
     """What colours mean: the values at the lower and upper end of a colour map, with their unit.
 
     Arrows at the ends say that some of what is shown lies below, or above.
+
+    Args:
+        isotherm: ends between which values have the colour ``MARKED`` in place of that of the map; None marks none.
+        contours: values at which lines are drawn, or their distance; None draws none.
     """
 
     low: float
@@ -80,6 +113,36 @@ class Bar:
     colormap: str = THERMAL
     below: bool = False
     above: bool = False
+    isotherm: tuple[float, float] | None = None
+    contours: float | Sequence[float] | None = None
+
+    def marks(self, values: np.ndarray) -> np.ndarray:
+        """Which of some values the isotherm holds, bool of their shape."""
+        low, high = self.isotherm or (np.inf, -np.inf)
+        return (values >= low) & (values <= high)
+
+    @property
+    def marked(self) -> str:
+        """What the isotherm holds in words, such as "above 30 °C"."""
+        ends = [f"{end:.4g}" for end in self.isotherm if np.isfinite(end)]
+        how = "between" if len(ends) == 2 else "above" if np.isfinite(self.isotherm[0]) else "below"
+        return f"{how} {' and '.join(ends)} {self.unit}".replace("-", "−")
+
+    def levels(self) -> list[float]:
+        """Values of the contour lines; of those at a distance, its multiples between the ends.
+
+        Raises:
+            SceneError: these are more than ``MOST_CONTOURS``.
+        """
+        if self.contours is None or isinstance(self.contours, Sequence):
+            return sorted(set(self.contours or ()))
+        if (self.high - self.low) / self.contours > MOST_CONTOURS:
+            raise SceneError(
+                f"contours={self.contours:g} draws more than {MOST_CONTOURS} lines between {self.low:.4g} and {self.high:.4g} "
+                f"{self.unit}: give {_round_up((self.high - self.low) / MOST_CONTOURS):g} or more, or a list of values"
+            )
+        first, last = np.ceil(self.low / self.contours), np.floor(self.high / self.contours)
+        return (np.arange(first, last + 1) * self.contours).tolist()
 
     def of(self, *images: Any) -> Bar:
         """The bar with arrows where values of these images lie beyond its ends by more than a hundredth of their distance."""
@@ -95,12 +158,16 @@ class Bar:
 
 @dataclass(frozen=True)
 class Panel:
-    """One image [H, W, 3] uint8 under a title, with a bar at its right or without, or a text over a cell without an image."""
+    """One image [H, W, 3] uint8 under a title, with a bar at its right or without, or a text over a cell without an image.
+
+    Over it contour lines may run: of each its value, and its places (x, y) [n, 2] in pixels from the middle of the first one.
+    """
 
     image: np.ndarray
     title: str
     bar: Bar | None = None
     text: str = ""
+    lines: Sequence[tuple[float, np.ndarray]] = ()
 
 
 def colorize(values: Any, low: float, high: float, colormap: str = THERMAL) -> np.ndarray:
@@ -147,8 +214,21 @@ def image_panel(image: Any, title: str, bar: Bar, thermal_range: ThermalRange | 
     if image.shape[-1] == 3:
         return Panel(visible(image), title)
     values = np.asarray((image if thermal_range is None else thermal_range.to_celsius(image))[..., 0])
-    told = " · ".join(part for part in (title, beyond(values, bar)) if part)
-    return Panel(colorize(values, bar.low, bar.high, bar.colormap), told, bar.of(values))
+    colours, marked = colorize(values, bar.low, bar.high, bar.colormap), bar.marks(values)
+    colours[marked] = MARKED
+    isotherm = bar.isotherm and f"green: {100 * marked.sum() / max(np.isfinite(values).sum(), 1):.1f} % {bar.marked}"
+    told = " · ".join(part for part in (title, isotherm, beyond(values, bar)) if part)
+    return Panel(colours, told, bar.of(values), lines=contour_lines(values, bar.levels()))
+
+
+def contour_lines(values: np.ndarray, levels: Sequence[float]) -> list[tuple[float, np.ndarray]]:
+    """Contour lines of an image [H, W] as ``Panel`` has them; they end where NaN is."""
+    known = values[np.isfinite(values)]
+    levels = [level for level in levels if known.size and known.min() < level < known.max()]
+    if not levels or min(values.shape) < 2:
+        return []
+    found = Figure().subplots().contour(np.ma.masked_invalid(values), levels)
+    return [(float(level), line) for level, lines in zip(found.levels, found.allsegs, strict=True) for line in lines]
 
 
 def beyond(values: Any, bar: Bar) -> str:
@@ -315,18 +395,22 @@ def _row(panels: Sequence[Panel]) -> np.ndarray:
     x, y = 0, line
     for panel, marks, step in zip(panels, ticks, widths, strict=True):
         draw.text((x, 0), _fit(panel.title, step), font=_font(FONT), fill=INK)
-        page.paste(Image.fromarray(np.ascontiguousarray(enlarged(panel.image, factor))), (x, y))
+        page.paste(Image.fromarray(_with_lines(enlarged(panel.image, factor), panel.lines, factor)), (x, y))
+        _label_lines(draw, panel.lines, (x, y), factor)
         if panel.text:
             draw.text((x + width / 2, y + height / 2), _fit(panel.text, width), font=_font(FONT), fill=INK, anchor="mm")
         if panel.bar:
             left = x + width + 6
-            ramp = np.broadcast_to(
-                lut(panel.bar.colormap)[np.linspace(255, 0, height).round().astype(int), None], (height, BAR, 3)
-            )
+            ramp = np.broadcast_to(_ramp(panel.bar, height)[::-1, None], (height, BAR, 3))
             page.paste(Image.fromarray(np.ascontiguousarray(ramp)), (left, y))
             draw.rectangle((left - 1, y - 1, left + BAR, y + height), outline=(170, 170, 170))
+            span = panel.bar.high - panel.bar.low
+            for level in panel.bar.levels():
+                if panel.bar.low <= level <= panel.bar.high and span > 0:
+                    row = y + round((height - 1) * (1 - (level - panel.bar.low) / span))
+                    draw.line((left, row, left + BAR - 1, row), fill=INK, width=3)
+                    draw.line((left, row, left + BAR - 1, row), fill="white")
             for value, text in marks:
-                span = panel.bar.high - panel.bar.low
                 row = y + (height - 1) * (1 - ((value - panel.bar.low) / span if span > 0 else 0.5))
                 draw.line((left + BAR, row, left + BAR + 3, row), fill=INK)
                 draw.text((left + BAR + 6, row), text, font=_font(FONT), fill=INK, anchor="lm")
@@ -335,9 +419,41 @@ def _row(panels: Sequence[Panel]) -> np.ndarray:
     return np.asarray(page)
 
 
+def _ramp(bar: Bar, count: int) -> np.ndarray:
+    """Colours along a bar from its low to its high end, uint8 [count, 3]."""
+    colours = lut(bar.colormap)[np.linspace(0, 255, count).round().astype(int)]
+    colours[bar.marks(np.linspace(bar.low, bar.high, count))] = MARKED
+    return colours
+
+
+def _with_lines(image: np.ndarray, lines: Sequence[tuple[float, np.ndarray]], factor: int) -> np.ndarray:
+    """An image that was enlarged by a factor with contour lines of the smaller one: white between dark edges."""
+    image = np.ascontiguousarray(image)
+    for width, colour in ((3, INK), (1, (255, 255, 255))):
+        for _, line in lines:
+            points = np.rint(((line + 0.5) * factor - 0.5) * 16).astype(np.int32)
+            cv2.polylines(image, [points], False, colour, width, cv2.LINE_AA, shift=4)
+    return image
+
+
+def _label_lines(
+    draw: ImageDraw.ImageDraw, lines: Sequence[tuple[float, np.ndarray]], corner: tuple[int, int], factor: int
+) -> None:
+    """Writes the value of each level in the middle of its longest contour line, where that is long enough."""
+    longest: dict[float, tuple[float, np.ndarray]] = {}
+    for level, line in lines:
+        length = factor * float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
+        if length > max(longest.get(level, (LABELLED,))[0], LABELLED):
+            longest[level] = length, line[len(line) // 2]
+    for level, (_, place) in longest.items():
+        at = tuple(float(start + (part + 0.5) * factor) for start, part in zip(corner, place, strict=True))
+        text = f"{level:.4g}".replace("-", "−")
+        draw.text(at, text, font=_font(FONT), fill="white", anchor="mm", stroke_width=2, stroke_fill=INK)
+
+
 def _arrows(draw: ImageDraw.ImageDraw, bar: Bar, left: int, top: int, height: int) -> None:
     """Draws triangles in the colours of the ends of a bar beyond which there are values, in place of its last pixels."""
-    colours = lut(bar.colormap)
+    colours = _ramp(bar, 256)
     for there, tip, way, colour in (
         (bar.above, top, 1, colours[-1]),
         (bar.below, top + height - 1, -1, colours[0]),
@@ -366,15 +482,21 @@ def write_figure(path: str | Path, panels: Sequence[Panel], title: str = "") -> 
         for i, panel in enumerate(panels, start=1):
             axes = figure.add_subplot(1, len(panels), i)
             axes.imshow(panel.image, interpolation="none")
+            for _, line in panel.lines:
+                axes.plot(*line.T, color="black", linewidth=1.0, scalex=False, scaley=False)
+                axes.plot(*line.T, color="white", linewidth=0.4, scalex=False, scaley=False)
             axes.set_title(literal(panel.title), fontsize=8)
             axes.set_axis_off()
             if panel.text:
                 axes.text(0.5, 0.5, literal(panel.text), ha="center", va="center", transform=axes.transAxes)
             if (bar := panel.bar) is not None:
-                colours = ScalarMappable(Normalize(bar.low, bar.high), bar.colormap)
+                colormap = ListedColormap(_ramp(bar, 256) / 255) if bar.isotherm else bar.colormap
+                colours = ScalarMappable(Normalize(bar.low, bar.high), colormap)
                 extend = {(True, True): "both", (True, False): "min", (False, True): "max"}
                 ends = extend.get((bar.below, bar.above), "neither")
-                figure.colorbar(colours, ax=axes, fraction=0.05, pad=0.02, label=bar.unit, extend=ends)
+                drawn = figure.colorbar(colours, ax=axes, fraction=0.05, pad=0.02, label=bar.unit, extend=ends)
+                for level in bar.levels():
+                    drawn.ax.axhline(level, color="white", linewidth=0.4)
         date = {".pdf": "CreationDate", ".svg": "Date"}[path.suffix]
         figure.savefig(path, metadata={date: None})
 

@@ -6,23 +6,29 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from heatsplat.contracts import evenly_spread
 from heatsplat.doctor.base import Check, Finding, Material, some
+from heatsplat.physics.defects import dead_pixels
 
 BLURRED = 0.7  # of the sharpness of the frames around
+DEAD_FRAMES = 8  # from which dead pixels are told
 CLEAR = 8.0  # contrast in noise from which sharpness can be told
 
 
 def find(material: Material) -> list[Finding]:
     if len(material.images) < 6 or min(material.images.shape[1:]) < 24 or material.contrast < CLEAR * material.noise:
         return []
-    sharp = [_sharpness(*_filled(material, f), material.noise) for f in range(len(material.images))]
+    dead = dead_pixels(
+        material.images[evenly_spread(len(material.images), DEAD_FRAMES)].float()
+    )  # sharp in every frame
+    sharp = [_sharpness(*_filled(material, f, dead), material.noise) for f in range(len(material.images))]
     sharp = torch.tensor(sharp).double()
     around = torch.stack([sharp[max(0, f - 4) : f + 5].nanmedian() for f in range(len(sharp))])
     worst = [f for f in range(len(sharp)) if float(sharp[f]) < BLURRED * float(around[f])]
     if not worst:
         return []
     names = [material.name(f) for f in worst]
-    along = sum(_direction(*_filled(material, f)) for f in worst) / len(worst)
+    along = sum(_direction(*_filled(material, f, dead)) for f in worst) / len(worst)
     kind = "along one direction: motion" if along > 0.5 else "in all directions: focus, or motion along several"
     return [
         Finding(
@@ -35,9 +41,9 @@ def find(material: Material) -> list[Finding]:
     ]
 
 
-def _filled(material: Material, frame: int) -> tuple[Tensor, Tensor]:
-    """The image of a frame with its median where pixels do not count, and which of them do."""
-    image, counts = material.image(frame), material.counts(frame)
+def _filled(material: Material, frame: int, dead: Tensor) -> tuple[Tensor, Tensor]:
+    """The image of a frame with its median where pixels do not count, and which of them do: none of the dead ones."""
+    image, counts = material.image(frame), material.counts(frame) & ~dead
     if bool(counts.all()):
         return image, counts
     return image.where(counts, image[counts].median() if bool(counts.any()) else 0.0), counts

@@ -58,6 +58,7 @@ class Map(Format):
 
     suffix = ".tif"
     from_origin = False
+    of_gaussians = False
 
     def __init__(
         self,

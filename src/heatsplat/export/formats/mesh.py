@@ -36,6 +36,7 @@ class Mesh(Format):
 
     suffix = ".ply"
     from_origin = False
+    of_gaussians = False
 
     def __init__(
         self,
