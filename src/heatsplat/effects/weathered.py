@@ -94,9 +94,8 @@ def judged(weathered: Weathered | None, name: str, why: str) -> Evidence:
         evidence = weighed(gain, found, large, False, "more of them in the dark", least_db, sigmas=PART_SIGMAS)
     else:
         evidence = weighed(gain, found, large, none, "", least_db, nothing_db, PART_SIGMAS)
-    return replace(
-        evidence, likely=gain.sigmas > CHANCE
-    )  # sun, sky and wind are there more often than not under the sky
+    # Sun, sky and wind are there more often than not under the sky.
+    return replace(evidence, likely=gain.sigmas > CHANCE)
 
 
 def around(inspected: Inspection, name: str) -> Evidence:
@@ -218,11 +217,9 @@ class Weathered:
     @cached_property
     def full(self) -> FullBalance:
         """Full balances of some of the points, dry and under a clear sky."""
-        some = slice(None, None, math.ceil(len(self.values) / FULL_POINTS))
-        seen = (self.values[some], self.errors[some], self.weights[some])
-        return FullBalance(
-            self.weather, self._sky_k, self.times_s, *seen, None if self.normals is None else self.normals[some]
-        )
+        some = slice(None, None, max(1, math.ceil(len(self.values) / FULL_POINTS)))
+        seen = [None if one is None else one[some] for one in (self.values, self.errors, self.weights, self.normals)]
+        return FullBalance(self.weather, self._sky_k, self.times_s, *seen)
 
     @cached_property
     def _wet(self) -> FullBalance:
