@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.strengths import strengths
 from heatsplat.contracts import SceneData, SceneError, check_count
+from heatsplat.effects.assembly import drop_impossible, reconcile
 from heatsplat.effects.base import Verdict
 from heatsplat.effects.catalogue import CATALOGUE, decide
 from heatsplat.io.files import write_atomically
@@ -369,7 +370,7 @@ def _outcomes(data: Callable[..., Any], cases: Sequence[tuple[str, str, int]], j
 
 
 def outcome_of(data: Callable[..., Any], scene: str, size: str, seed: int) -> Outcome:
-    """The verdicts on one recording of a scene.
+    """The verdicts on one recording of a scene, as a run simulates them.
 
     Raises:
         SceneError: nobody knows what effects the scene shows.
@@ -381,7 +382,7 @@ def outcome_of(data: Callable[..., Any], scene: str, size: str, seed: int) -> Ou
             f"scene '{recorded.name}' does not say in its notes which effects it shows; judge synthetic ones"
         )
     start = time.process_time()
-    verdicts = decide(recorded)
+    verdicts = reconcile(drop_impossible(decide(recorded), recorded))
     seconds = time.process_time() - start
     conditions = tuple(name for name, holds in CONDITIONS.items() if holds(recorded))
     strong = strengths(module) if scene.startswith(DRAWN) else {}
