@@ -176,6 +176,12 @@ def test_a_part_is_absent_if_it_gains_nothing_and_nothing_says_that_it_may_be_th
     assert evidence.told == told and evidence.statistic < 4, evidence
 
 
+def test_what_full_balances_gain_is_large_whatever_linear_ones_take_for_it():
+    told = judged(gains(NONE, HeldOut(6.0, 10.0, 48), share=0.05), "radiation", "")
+    assert told.told and told.statistic == 10.0
+    assert not judged(gains(HeldOut(6.0, 10.0, 48), share=0.05), "radiation", "").told
+
+
 def test_without_a_record_nothing_is_told():
     evidence = judged(None, "solar", "there is no record")
     assert not evidence.told and evidence.reason == "there is no record"

@@ -80,15 +80,16 @@ def judged(weathered: Weathered | None, name: str, why: str) -> Evidence:
     if weathered is None:
         return Evidence(None, why, told=False)
     # Where frames are few, linear balances are told by what is expected of them; of many, full ones explain three times as much.
-    told = (weathered.gain(name), MIN_DB), (weathered.full_gain(name), FULL_DB)
-    gain, least_db = max(told, key=lambda one: (one[0].exceeds(one[1], PART_SIGMAS), one[0].sigmas))
+    linear, full = weathered.gain(name), weathered.full_gain(name)
+    fully = (full.exceeds(FULL_DB, PART_SIGMAS), full.sigmas) > (linear.exceeds(MIN_DB, PART_SIGMAS), linear.sigmas)
+    gain, least_db = (full, FULL_DB) if fully else (linear, MIN_DB)
     found = f"balances of heat gain {gain.db:.2f} dB by it where left out, {gain.sigmas:.1f} standard errors"
     large, none = True, True
     if name in LEAST:
-        share = weathered.shares[name]
-        large = share > LEAST[name]
+        share = weathered.shares[name]  # of linear balances, which say less where full ones gain
+        large, none = fully or share > LEAST[name], share <= LEAST[name]
         # Few frames gain nothing by it, but what bodies take says that it may be there. Where it is not, that is 0.02 at most.
-        found, none = f"{found}; bodies take a share of {share:.2f}", not large
+        found = f"{found}; bodies take a share of {share:.2f}"
     nothing_db = 0.25 * least_db if gain.sigmas <= PART_SIGMAS else 0.0  # what is no chance is there, however small
     if name == "radiation" and not weathered.dark:
         evidence = weighed(gain, found, large, False, "more of them in the dark", least_db, sigmas=PART_SIGMAS)
