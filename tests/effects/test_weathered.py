@@ -24,6 +24,8 @@ from heatsplat.effects.weathered import (
     Weathered,
     around,
     judged,
+    told_of_clouds,
+    told_of_water,
     water_on,
     weighed,
 )
@@ -103,7 +105,8 @@ def test_a_sky_under_clouds_is_told_from_a_clear_one():
         return 0.5 + 0.5 * torch.sin(2.0 * torch.pi * hours / 5.0)
 
     assert recorded(clouds=passing).clouded
-    assert not recorded(clouds=passing, without="clouds").clouded
+    clear = recorded(clouds=passing, without="clouds")
+    assert not clear.clouded and "; clouds leave the sky cold (gain -" in told_of_clouds(clear)
     assert not recorded().clouded
 
 
@@ -151,8 +154,14 @@ def test_water_is_told_to_a_balance_that_is_solved_as_it_stands(monkeypatch, ben
     monkeypatch.setattr("heatsplat.effects.weathered.weather_record.bent", lambda obs: bent)
     obs = SimpleNamespace(tracks=object() if tracks else None)
     for rained, transpires in ((True, True), (True, False), (False, True), (False, False)):
-        seen = SimpleNamespace(weathered=SimpleNamespace(rained=rained, transpires=transpires), obs=obs)
+        gained = {"rain": HeldOut(0.25, 3.1, 48), "plants": HeldOut(0.01, 0.1, 48)}
+        weathered = SimpleNamespace(rained=rained, transpires=transpires, **gained)
+        seen = SimpleNamespace(weathered=weathered, obs=obs)
         assert water_on(seen) == {"rain": FILM_MM if told and rained else None, "transpires": told and transpires}
+        found = told_of_water(seen)
+        assert ("rain wets surfaces (gain 0.25 dB, 3.1 standard errors)" in found) == (told and rained)
+        assert ("surfaces do not transpire (gain 0.01" in found) == (told and not transpires)
+    assert told_of_water(SimpleNamespace(weathered=None, obs=obs)) == "" == told_of_clouds(None)
     assert water_on(SimpleNamespace(weathered=None, obs=obs)) == {"rain": None, "transpires": False}
 
 

@@ -119,12 +119,37 @@ def around(inspected: Inspection, name: str) -> Evidence:
 
 
 def water_on(inspected: Inspection) -> dict[str, Any]:
-    """What the state of a scene is told of water: how many mm of rain surfaces keep, None for none, and whether they transpire.
-    Only a balance that is solved as it stands knows either."""
-    weathered, obs = inspected.weathered, inspected.obs
-    if weathered is None or obs.tracks is None or not weather_record.bent(obs):
+    """What the state of a scene is told of water: mm of rain that surfaces keep, None for none, and whether they transpire."""
+    weathered = _as_it_stands(inspected)
+    if weathered is None:
         return {"rain": None, "transpires": False}
     return {"rain": FILM_MM if weathered.rained else None, "transpires": weathered.transpires}
+
+
+def told_of_water(inspected: Inspection) -> str:
+    """Clauses of a reason on what rain and plants gain, each after a semicolon; empty where nothing is told of them."""
+    weathered = _as_it_stands(inspected)
+    if weathered is None:
+        return ""
+    rain = _told(weathered.rain, "rain wets surfaces" if weathered.rained else "rain leaves surfaces dry")
+    return rain + _told(weathered.plants, "surfaces transpire" if weathered.transpires else "surfaces do not transpire")
+
+
+def told_of_clouds(weathered: Weathered | None) -> str:
+    """The same on clouds of the record."""
+    if weathered is None:
+        return ""
+    return _told(weathered.clouds, "clouds warm the sky" if weathered.clouded else "clouds leave the sky cold")
+
+
+def _as_it_stands(inspected: Inspection) -> Weathered | None:
+    """What only a balance knows that is solved as it stands; None where it will be solved about its mean, or nothing is told."""
+    told = inspected.weathered is not None and inspected.obs.tracks is not None
+    return inspected.weathered if told and weather_record.bent(inspected.obs) else None
+
+
+def _told(gain: HeldOut | None, found: str) -> str:
+    return "" if gain is None else f"; {found} (gain {gain.db:.2f} dB, {gain.sigmas:.1f} standard errors)"
 
 
 def weighed(
@@ -187,33 +212,44 @@ class Weathered:
         """Temperatures that a body has: 2, surface and core, where that explains observations better that were left out."""
         return 2 if self.gain(DEPTH).exceeds(MIN_DB, SIGMAS) else 1
 
-    @cached_property
+    @property
     def rained(self) -> bool:
         """Whether the record's rain wets surfaces: it does, unless dry ones explain observations better that were left out."""
-        weather = self.weather
-        if weather.rain_mm_h is None or weather.humidity_percent is None or not bool((weather.rain_mm_h > 0).any()):
-            return False
-        wet = replace(self.full, film_mm=FILM_MM)
-        return compared(wet.squares, self.full.squares, self.full.weights).sigmas > AGAINST
+        return self.rain is not None and self.rain.sigmas > AGAINST
 
-    @cached_property
+    @property
     def clouded(self) -> bool:
         """Whether clouds of the record warm the sky: they do, unless a clear one explains observations better that were left
         out. Many a fair day does not tell, and overcast ones are foreseen wrongly without clouds."""
-        if self.weather.clouds is None or "radiation" not in self.parts:
-            return False
-        clouded = replace(self._wet, sky_k=self._clouded_k)
-        return compared(clouded.squares, self._wet.squares, self.full.weights).sigmas > AGAINST
+        return self.clouds is not None and self.clouds.sigmas > AGAINST
 
-    @cached_property
+    @property
     def transpires(self) -> bool:
         """Whether surfaces that evaporate water where they are dry, each its own share, explain them better."""
+        return self.plants is not None and self.plants.exceeds(PLANTS_DB, PLANTS_SIGMAS)
+
+    @cached_property
+    def rain(self) -> HeldOut | None:
+        """What the record's rain gains; None where it tells of none, or not how moist the air is."""
+        weather = self.weather
+        if weather.rain_mm_h is None or weather.humidity_percent is None or not bool((weather.rain_mm_h > 0).any()):
+            return None
+        return self._over(replace(self.full, film_mm=FILM_MM), self.full)
+
+    @cached_property
+    def clouds(self) -> HeldOut | None:
+        """What clouds of the record gain; None where it does not tell them, or no sky is asked for."""
+        if self.weather.clouds is None or "radiation" not in self.parts:
+            return None
+        return self._over(replace(self._wet, sky_k=self._clouded_k), self._wet)
+
+    @cached_property
+    def plants(self) -> HeldOut | None:
+        """What transpiration gains; None where nobody knows how moist the air is."""
         if self.weather.humidity_percent is None:
-            return False
+            return None
         dry = replace(self._wet, sky_k=self._clouded_k) if self.clouded else self._wet
-        return compared(replace(dry, transpires=True).squares, dry.squares, self.full.weights).exceeds(
-            PLANTS_DB, PLANTS_SIGMAS
-        )
+        return self._over(replace(dry, transpires=True), dry)
 
     @cached_property
     def full(self) -> FullBalance:
@@ -233,7 +269,10 @@ class Weathered:
 
     def full_gain(self, name: str) -> HeldOut:
         """What one of PARTS gains beside the others in full balances."""
-        return compared(self.full.squares, self.full.without(name).squares, self.full.weights)
+        return self._over(self.full, self.full.without(name))
+
+    def _over(self, more: FullBalance, less: FullBalance) -> HeldOut:
+        return compared(more.squares, less.squares, self.full.weights)
 
     def beside(self, name: str) -> HeldOut | None:
         """What one of SHADOWS, ALBEDO, MIRRORED and SKY_VIEW gains; None where nobody knows how surfaces face light or, but for

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.weathered import NO_BALANCE, PART_SIGMAS, judged
+from heatsplat.effects.weathered import NO_BALANCE, PART_SIGMAS, judged, told_of_water
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -13,7 +15,8 @@ def evidence(inspected: Inspection) -> Evidence:
     weather = inspected.scene.weather
     if weather.wind_m_s is None or weather.air_c is None:
         return Evidence(None, "the record has no wind, or no air temperature")
-    return judged(inspected.weathered, "convection", inspected.obs.why or NO_BALANCE)
+    found = judged(inspected.weathered, "convection", inspected.obs.why or NO_BALANCE)
+    return replace(found, reason=found.reason + told_of_water(inspected))
 
 
 EFFECT = Effect(

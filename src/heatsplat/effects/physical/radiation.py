@@ -7,7 +7,7 @@ from dataclasses import replace
 from heatsplat.effects import weather_record
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.inspection import Inspection
-from heatsplat.effects.weathered import NO_BALANCE, PART_SIGMAS, judged, water_on
+from heatsplat.effects.weathered import NO_BALANCE, PART_SIGMAS, judged, told_of_clouds, water_on
 
 
 def evidence(inspected: Inspection) -> Evidence:
@@ -23,7 +23,8 @@ def evidence(inspected: Inspection) -> Evidence:
     bent, weathered = weather_record.bent(obs), inspected.weathered
     nodes = 1 if weathered is None else weathered.nodes
     settings = {"solution": "corrected" if bent else "linear", "nodes": nodes} | water_on(inspected)
-    return replace(found, settings=settings | {"clouds": weathered is not None and weathered.clouded})
+    settings["clouds"] = weathered is not None and weathered.clouded
+    return replace(found, reason=found.reason + told_of_clouds(weathered), settings=settings)
 
 
 EFFECT = Effect(
