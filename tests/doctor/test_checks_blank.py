@@ -29,4 +29,5 @@ def test_a_recording_of_one_temperature_shows_nothing():
     images = torch.full_like(clean().images, 0.1)
     (found,) = findings_of(changed(clean(), images), "blank")
     assert f"{len(images)} of {len(images)} frames have one level all over" in found.what and "others" not in found.what
+    assert found.remedy.startswith("Record or export them again")
     assert {"agc", "sharpness", "duplicates"}.isdisjoint(checks(changed(clean(), images)))
