@@ -403,7 +403,11 @@ def _range_of(prepared: Sequence[PreparedImage], counts: Counts) -> tuple[Therma
                 high.append(float(p.thermal[keep].max()))
     low, high = (min(lows), max(highs)) if lows else (0.0, 0.0)
     if not low < high:
-        raise SceneError(f"the training images are constant ({low}), so no temperature range can be taken from them")
+        what = f"are constant ({counts.scale * low + counts.offset_c:g} °C)" if lows else "have no pixel that counts"
+        raise SceneError(
+            f"the training images {what}, so no temperature range can be taken from them: was the shutter closed, or did the "
+            "export lose what they show? Else give data.bounds_c=[min,max] (data=colmap) or temperature_bounds.json"
+        )
     margin = RANGE_MARGIN * (high - low)
     ends = (low - margin, high + margin, min(all_lows), max(all_highs))
     low_c, high_c, *seen_c = (counts.scale * end + counts.offset_c for end in ends)

@@ -424,6 +424,8 @@ def _recorded(folders: Sequence[Path]) -> dict[str, dict[str, str]]:
     if path is None:
         return {}
     table = read_table(path)
+    if "file" not in table.columns:  # one of the user's own
+        return {}
     kept = [(i, c) for i, c in enumerate(table.columns) if c in {"time", *PLACED}]
     return {
         stem_of(cells[table.columns.index("file")]): {column: cells[i] for i, column in kept} for _, cells in table.rows

@@ -109,7 +109,9 @@ def recording(
     if photos := sum(r["photo"] is not None for r in records):
         lines.append(f"- with a photo of the same moment: {photos}")
     if unknown := sum(r["unknown_pixels"] for r in records):
-        lines.append(f"- {unknown} pixels lie outside the camera's calibration and are NaN")
+        lines.append(
+            f"- {unknown} pixels have no temperature in their files, or one outside the camera's calibration, and are NaN"
+        )
     if any(f.calibration is not None for f in frames):
         known = [r["quantiles"] for r in records if r["quantiles"]]
         lines.append(

@@ -333,6 +333,8 @@ def test_every_training_view_is_a_sighting_on_a_coarse_grid():
         ({"time": float("nan")}, "time must be a number, got nan"),
         ({"time": []}, "time must be a number of seconds"),
         ({"time": [0, 1, 2]}, r"time must be one moment or \[start, end\], got \[0, 1, 2\]"),
+        ({"view": "--5"}, "view '--5' is no training frame; there are 0.png"),
+        ({"view": "²"}, "view '²' is no training frame; there are 0.png"),
         ({"view": 1.9}, "view must be the whole number or the file name of a training frame, got 1.9"),
         ({"count": 1.5}, "frames must be a whole number, 1 or more, got 1.5"),
         ({"count": 0}, "frames must be a whole number, 1 or more, got 0"),
@@ -341,6 +343,13 @@ def test_every_training_view_is_a_sighting_on_a_coarse_grid():
 def test_a_setting_that_makes_no_shot_is_named(settings, told):
     with pytest.raises(SceneError, match=told):
         shot_frames(make_scene(), **{"trajectory": "view", **settings})
+
+
+def test_views_of_which_the_scene_has_none_are_no_shot():
+    scene = make_scene()
+    scene = replace(scene, test=scene.test.subset([]))
+    with pytest.raises(SceneError, match="trajectory=test: scene 'yard' has no such views; give another trajectory"):
+        shot_frames(scene, "test")
 
 
 def test_moving_cameras_and_a_view_have_finer_pixels_where_training_rendered_them():

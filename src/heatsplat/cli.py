@@ -6,6 +6,7 @@ What brings torch is imported within a job, so that --help, --cfg and typing err
 from __future__ import annotations
 
 import functools
+import io
 import logging
 import os
 import shutil
@@ -88,6 +89,7 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
     @functools.wraps(main)
     def command() -> Any:
         nonlocal all_of_it
+        _print_what_can_be()
         if len(sys.argv) == 1:
             script = sys.argv[0] if sys.argv[0].endswith(".py") else f"heatsplat-{name}"
             script = f"python {script}" if script.endswith(".py") else script
@@ -111,7 +113,7 @@ def _command(job: Callable[[DictConfig], Any]) -> Callable[[], Any]:
                 sys.stdout.flush()  # here, where a reader that has gone is no error, not when Python ends
         except BrokenPipeError:  # as of --help | head
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has no reader
-            sys.exit(128 + signal.SIGPIPE)
+            sys.exit(128 + 13)  # SIGPIPE, which Windows does not have
         except KeyboardInterrupt:  # where no checkpoint can be written yet, or any more
             if all_of_it:
                 raise
@@ -154,6 +156,13 @@ def _settings_first(arguments: Sequence[str]) -> list[str]:
     return [*with_names(settings), *flags]
 
 
+def _print_what_can_be() -> None:
+    """Has standard output spell out what its encoding lacks, as standard error does: on Windows a pipe or a file may know no τ or
+    dash, and a run would end at its table."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
 def _job(
     work: Callable[[dict[str, Any], Path], Any], check: Callable[[DictConfig, Path], None] | None = None
 ) -> Callable[[DictConfig], Any]:
@@ -168,6 +177,7 @@ def _job(
 
     @functools.wraps(work)
     def job(config: DictConfig) -> Any:
+        _print_what_can_be()  # here, too, as a launcher's processes begin here
         hydra_config = HydraConfig.get()
         output_dir = Path(hydra_config.runtime.output_dir)
         try:

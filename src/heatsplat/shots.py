@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import logging
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -71,12 +72,17 @@ def shot_frames(
         cameras: those of "cameras" and "path", in the world and on the clock of the scene; a time of None is not known.
 
     Raises:
-        SceneError: a setting that ``check_shot`` refuses, an unknown view, or no orbit where all cameras look along one line.
+        SceneError: a setting that ``check_shot`` refuses, an unknown view, views of which the scene has none, or no orbit where
+            all cameras look along one line.
     """
     check_shot(trajectory, time, view, count)
     time = None if time is None else seconds_in(scene, time)
     if trajectory in ("test", "train"):
         frames = getattr(scene, trajectory).frames
+        if not frames:
+            raise SceneError(
+                f"trajectory={trajectory}: scene '{scene.name}' has no such views; give another trajectory"
+            )
         own = [frame.time_s for frame in frames]
     elif trajectory == "cameras":
         frames = _numbered(scene, [(frame.name, frame.camera) for frame in cameras])
@@ -203,7 +209,7 @@ def _moving(scene: SceneData, trajectory: str, count: int, given: Sequence[Frame
 def viewed(scene: SceneData, view: int | str) -> Frame:
     """A training frame by its position or file name. Raises SceneError where there is none, or several have the name."""
     taken = scene.train.frames
-    if isinstance(view, str) and not view.lstrip("-").isdigit():
+    if isinstance(view, str) and not re.fullmatch(r"-?[0-9]+", view):
         names = [frame.name for frame in taken]
         alike = [i for i, name in enumerate(names) if Path(name).name == Path(view).name]
         found = [names.index(view)] if view in names else alike

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from functools import partial
 from pathlib import Path
 
@@ -58,7 +59,7 @@ def test_recordings_without_thresholds_set_on_them_are_counted_apart(outcomes):
     last = outcomes[-1].seed
     fresh = [outcome for outcome in outcomes if outcome.seed == last]
     text = written(outcomes, frozenset({last}))
-    cases = [int(line.split()[1]) for line in text.splitlines() if line.startswith("Of ")]
+    cases = [int(line.split()[1]) for line in text.splitlines() if re.match(r"Of \d+ verdicts ", line)]
     assert cases == [len(CATALOGUE) * (len(outcomes) - len(fresh)), len(CATALOGUE) * len(fresh)]
     assert "## Verdicts compared with the truth, tiny, on recordings not used to set thresholds" in text
 
@@ -142,10 +143,35 @@ def test_the_document_is_written_of_all_scenes_and_kinds_and_says_how_it_was_mad
     assert set(evidence.SCENES) <= set(PRESETS | OUTDOOR)
 
 
-def test_the_committed_page_begins_as_it_would_be_written_now():
+def test_the_committed_page_says_what_would_be_written_now_and_nothing_by_hand():
     page = (ROOT / "docs" / "effects.md").read_text()
     assert page.startswith(f"{evidence.TITLE}\n\nThis page is generated:\n`python src/study.py study=evidence ")
-    assert f"`.\n{evidence.HEAD}\n## The catalogue\n" in page
+    words, tables = page.split("\n## Verdicts compared", 1)
+    made_now = written([]).replace(
+        evidence.NEWEST, evidence.OLDER
+    )  # its tables are of verdicts before the last changes
+    assert words.split("`.\n", 1)[1].rstrip() == made_now.split("`.\n", 1)[1].rstrip()
+    assert evidence.STRENGTH_NOTE in tables and evidence.CHANGES in page
+    for known in (evidence.STRENGTH_NOTE, evidence.STRENGTH_AGAIN):
+        tables = tables.replace(known, "")
+    left = re.sub(
+        r"^(\||## Verdicts compared with the truth, |Of \d+ verdicts |The goal of ).*$",
+        "",
+        "## Verdicts compared" + tables,
+        flags=re.M,
+    )
+    assert left.strip() == ""
+
+
+def test_the_page_says_by_which_rules_its_verdicts_were_made(tmp_path, undecided):
+    made_now = run(tmp_path, Synthetic, ["static"], seeds=[0])
+    assert evidence.NEWEST in made_now and evidence.OLDER not in made_now
+    (path,) = (tmp_path / "verdicts").iterdir()
+    said = json.loads(path.read_text())
+    assert said.pop("rules") == evidence.RULES
+    path.write_text(json.dumps(said))  # as before verdicts said so
+    made_before = run(tmp_path, Synthetic, ["static"], seeds=[0])
+    assert evidence.OLDER in made_before and evidence.CHANGES in made_before
 
 
 def test_verdicts_are_counted_by_the_strength_of_effects():

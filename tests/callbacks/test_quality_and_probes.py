@@ -152,6 +152,17 @@ def test_curves_are_drawn_at_ever_fewer_validations_and_at_the_test(tmp_path, mo
     assert drawn[4:] == [(18, "test/probes")] and (tmp_path / "renders" / "probes.png").exists()
 
 
+def test_a_resumed_run_draws_curves_where_the_whole_one_does(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(TemperatureCurves, "_draw", lambda self, module, step, tag: drawn.append(step))
+    save = ModelCheckpoint(tmp_path, filename="{step}", every_n_train_steps=7, save_top_k=-1)
+    fit(FakeModule(wall(), tmp_path), trainer(tmp_path, [TemperatureCurves(times=3), save], steps=18, every=2))
+    assert drawn == [2, 4, 8, 16]
+    again = FakeModule(wall(), tmp_path / "b")
+    fit(again, trainer(tmp_path, [TemperatureCurves(times=3)], steps=18, every=2), ckpt=tmp_path / "step=7.ckpt")
+    assert drawn[4:] == [8, 16]
+
+
 def test_panels_without_logger_and_bounds(tmp_path):
     scored(wall(thermal_range=None), tmp_path, ImagePanels(test_views=-1), TemperatureCurves(times=4))
     assert len(list((tmp_path / "renders" / "test").glob("*.png"))) == 4

@@ -206,6 +206,44 @@ def test_resets_of_a_plan_that_is_moved_keep_their_place_in_it(moves, resets):
     assert [again._last_reset(step) for step in range(3500)] == [density._last_reset(step) for step in range(3500)]
 
 
+@pytest.mark.parametrize(
+    ("moves", "events"),
+    [
+        ({}, [600, 700, 800, 900, 1000, 1100, 1200, 1300]),
+        ({1000: 1.12}, [600, 700, 800, 900, 1000, 1112, 1224, 1336]),  # not at 1008, with eight views
+        ({1050: 0.5}, [600, 700, 800, 900, 1000, 1075, 1125, 1175]),
+        ({650: 0.5, 710: 3.0}, [600, 675, 755, 905, 1055, 1205, 1355, 1505]),
+    ],
+)
+@pytest.mark.parametrize("name", ["adaptive", "budget", "multiview_gate"])
+def test_refinements_of_a_plan_that_is_moved_keep_their_place_in_it(name, moves, events):
+    density, due = {
+        "adaptive": (Adaptive(start=500, every=100, reset_every=None), lambda step: density._comes("every", step)),
+        "budget": (Budget(start=500, every=100), lambda step: density._growth_in(step) == 0),
+        "multiview_gate": (
+            MultiviewGate(start=500, every=100, reset_every=None, views=5),
+            lambda step: density._next(step) == step + 1,
+        ),
+    }[name]
+    found = []
+    for step in range(510, 2000):
+        if step in moves:
+            density.retime(step, moves[step])
+        if due(step):
+            found.append(step + 1)
+    assert found[: len(events)] == events
+
+
+def test_an_event_of_a_plan_that_is_moved_adds_as_much_as_the_one_it_stands_for():
+    shares = []
+    for factor in (1.0, 0.3, 2.5):
+        density = Budget(start=500, stop=3000, every=100, curve="sqrt")
+        density.retime(1290, factor)
+        at = [step for step in range(1290, 9000) if density._growth_in(step) == 0]
+        shares.append([round(density._share(step), 12) for step in at])
+    assert len(shares[0]) == 18 and shares[0] == shares[1] == shares[2]
+
+
 def test_the_rest_of_a_plan_is_moved_and_what_is_past_stays():
     density = Adaptive(start=100, stop=1000, every=100, reset_every=None)
     density.retime(200, 0.5)

@@ -10,6 +10,7 @@ from running import TINY, compose_run, run
 from heatsplat import composition
 from heatsplat.runs.lock import OccupiedError
 from heatsplat.runs.resume import resumed
+from heatsplat.studies.finished import reason_of
 from hydra_plugins.heatsplat_launchers._jobs import DiedError, Job, _died
 
 
@@ -76,6 +77,14 @@ def test_a_job_whose_process_died_says_so_in_its_folder(tmp_path):
     (job.folder / "FAILED").write_text("what the job said itself")
     _died(job, DiedError("later"))
     assert (job.folder / "FAILED").read_text() == "what the job said itself"
+
+
+def test_why_a_process_died_is_written_and_read_whatever_its_letters(tmp_path):
+    job = Job(3, ("seed=1",), tmp_path / "job", None)
+    _died(job, DiedError("no scene a\udcfc at 20 °C"))  # of a file's name that is no UTF-8
+    assert reason_of(job.folder) == "DiedError: no scene a\\udcfc at 20 °C"
+    (job.folder / "FAILED").write_bytes("ValueError: 20 °C".encode("cp1252"))  # as Windows wrote it
+    assert reason_of(job.folder) == "ValueError: 20 \ufffdC"
 
 
 def test_under_slurm_a_stray_checkpoint_of_the_working_directory_is_not_gone_on_from(tmp_path, monkeypatch):

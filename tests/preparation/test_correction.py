@@ -162,6 +162,13 @@ def test_places_of_the_preparation_stay(tmp_path):
     assert set(rows[0]) == {"file", "time_s", "latitude_deg", "longitude_deg"}
 
 
+def test_a_table_of_the_users_own_tells_nothing_of_a_preparation(tmp_path):
+    (tmp_path / "frames.csv").write_text("image,seconds\n0.tiff,9\n1.tiff,10\n")
+    target = tmp_path / "new"
+    correct_scene(scene(), lambda frame: DEPTH, [tmp_path], target, GivenConditions(), BandResponse(), None, METRES)
+    assert set(next(csv.DictReader((target / "frames.csv").open()))) == {"file", "time_s"}
+
+
 def test_without_a_distance_that_is_given_the_typical_one_is_compared_with(tmp_path):
     page = correct_scene(scene(), lambda frame: DEPTH, [], tmp_path, GivenConditions(), BandResponse(), None, METRES)
     far = float((distances(CAMERA, DEPTH) * METRES)[DEPTH.isfinite()].median())

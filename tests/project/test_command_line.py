@@ -5,6 +5,7 @@ what it makes of a finished run, is asked of its function in this process, which
 """
 
 import inspect
+import io
 import json
 import logging
 import os
@@ -356,6 +357,33 @@ def test_help_of_preparation_lists_its_own_settings_with_their_units(tmp_path, t
     shell = f"{sys.executable} {ROOT / 'src' / 'train.py'} --help | head -1"
     ended = subprocess.run(shell, shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert "Traceback" not in ended.stderr and "BrokenPipe" not in ended.stderr
+
+
+def test_help_whose_reader_has_gone_is_no_error_where_there_is_no_sigpipe_as_on_windows(tmp_path, monkeypatch):
+    class Gone(io.StringIO):
+        def flush(self):
+            raise BrokenPipeError
+
+        def fileno(self):
+            return spare
+
+    with open(tmp_path / "spare", "w") as file:
+        spare = file.fileno()
+        monkeypatch.delattr(cli.signal, "SIGPIPE", raising=False)
+        monkeypatch.setattr(cli.sys, "argv", ["src/train.py", "--help"])
+        monkeypatch.setattr(cli.sys, "stdout", Gone())
+        with pytest.raises(SystemExit, match="141"):
+            cli.train()
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "cp932", "ascii"])
+def test_letters_that_a_console_does_not_have_are_spelled_out(encoding, tmp_path, monkeypatch):
+    shown = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    monkeypatch.setattr(cli.sys, "argv", ["src/train.py", "--help"])
+    monkeypatch.setattr(cli.sys, "stdout", shown)
+    cli.train()
+    text = shown.buffer.getvalue().decode(encoding)
+    assert "max_steps: 30000" in text and ("\\u03c4" in text) == (encoding != "cp932")
 
 
 @pytest.mark.parametrize(

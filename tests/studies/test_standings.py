@@ -8,7 +8,9 @@ from boards import ASKED, VIEWS, board, hand_in, protocol_folder, run_of, submis
 
 from heatsplat.io.results import RunResults
 from heatsplat.io.tiff import write_temperature
+from heatsplat.studies.leaderboard.page import page
 from heatsplat.studies.leaderboard.plan import board_of
+from heatsplat.studies.leaderboard.report import markdown, order
 from heatsplat.studies.leaderboard.standings import (
     Entry,
     Result,
@@ -167,6 +169,22 @@ def test_of_a_score_of_which_more_is_better_the_difference_stands_beside_the_ref
         ("3dgs", "steps"): (0.0, 1),
         ("etgs", "steps"): (pytest.approx(20.0, abs=1e-2), 1),
     }  # dB of a tenth
+
+
+@pytest.mark.parametrize("exact", ["etgs", "3dgs"])
+def test_renders_that_are_the_truth_on_one_scene_do_not_hide_it(exact, tmp_path):
+    root, sweep = protocol_folder(tmp_path / "root", "cooling", "driven"), tmp_path / "sweep"
+    for method in ("3dgs", "etgs"):
+        run_of(sweep, method, "cooling", 0, 0.0 if method == exact else 0.5)
+        run_of(sweep, method, "driven", 0, 0.5)
+    asked = board_of({**ASKED, "root": str(root)}, ["3dgs", "etgs"], ())
+    found = standings(sweep, asked)
+    ratio = (0.0005 / 0.5) ** (0.5 if exact == "etgs" else -0.5)
+    beside = beside_reference(found.entries, asked)
+    assert beside == {("3dgs", "steps"): (1.0, 2), ("etgs", "steps"): (pytest.approx(ratio, rel=1e-3), 2)}
+    assert order(found.entries, asked, "steps") == (["etgs", "3dgs"] if exact == "etgs" else ["3dgs", "etgs"])
+    told = "over the scenes on which both ran; errors below 0.0005 °C count as that."
+    assert told in markdown(found, asked) and "; errors below 0.0005 °C count as that" in page(found, asked, None)
 
 
 def test_runs_and_submissions_are_scored_alike_and_ranked_together(tmp_path):

@@ -93,6 +93,12 @@ class TemperatureCurves(pl.Callback):
     def on_test_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         self._draw(module, trainer.global_step, "test/probes")
 
+    def state_dict(self) -> dict[str, int]:
+        return {"validations": self._validations}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        self._validations = state["validations"]
+
     def _draw(self, module: pl.LightningModule, step: int, tag: str) -> None:
         scene = module.scene
         if not self._changes(module) or not (self.count or self._asked):

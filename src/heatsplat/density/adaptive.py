@@ -13,7 +13,6 @@ from heatsplat.density.ops import Cloud
 from heatsplat.geometry.rotations import quats_to_matrices
 
 SPLIT_SHRINK = 1.6  # scales of the two halves of a split Gaussian (Kerbl et al. 2023)
-ORIGIN = "resets_from"  # of a plan that was moved: the step, not rounded, from which resets are counted
 RECOVERY = 10  # refinements after which opacities have come back from a reset
 
 
@@ -98,7 +97,7 @@ class Adaptive(DensityControl):
     @torch.no_grad()
     def refine(self, cloud: Cloud, step: int, extent: float, generator: torch.Generator) -> DensityChange | None:
         added = removed = 0
-        due = self.start <= step < self.stop and (step + 1) % self.every == 0
+        due = self.start <= step < self.stop and self._comes("every", step)
         if due:
             added = self._grow(cloud, extent, generator)
             removed = self._prune(cloud, step, extent)
@@ -118,18 +117,8 @@ class Adaptive(DensityControl):
         if self.reset_every is None:
             return 0
         last = min(step + 1, self.stop - 1, self.opacities_until - RECOVERY * self.every)
-        every, origin = self._times.get("reset_every", self.reset_every), self._times.get(ORIGIN, 0)
-        number = int((last - origin) / every) + 1
-        while number > 0 and (after := math.ceil(origin + number * every)) > last:
-            number -= 1
-        return after if number > 0 else 0
-
-    def retime(self, step: int, factor: float) -> None:
-        """As every plan is moved. Resets go on from where they were between two of them: counted from the first step at another
-        interval, the next could follow the last at once."""
-        origin = self._times.get(ORIGIN, 0)
-        super().retime(step, factor)
-        self.load_times(self._times | {ORIGIN: step + factor * (origin - step)})
+        number = self._times_come("reset_every", last)
+        return self._comes_after("reset_every", number) if number > 0 else 0
 
     def _visible(self, opacities: Tensor) -> Tensor:
         """Which Gaussians [N] of opacities [M, N] need not be pruned as transparent."""

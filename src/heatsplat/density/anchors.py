@@ -104,7 +104,7 @@ class Anchors(DensityControl):
 
     @torch.no_grad()
     def refine(self, cloud: Cloud, step: int, extent: float, generator: torch.Generator) -> DensityChange | None:
-        if not self.grow_from <= step < self.stop or (step + 1) % self.every or "shown" not in cloud.state:
+        if not self.grow_from <= step < self.stop or not self._comes("every", step) or "shown" not in cloud.state:
             return None
         state, before = cloud.state, len(cloud)
         heard = state["shown"] > self.seen * self.every / 2

@@ -14,6 +14,9 @@ from heatsplat.contracts import Camera, RenderOutput, SceneData
 from heatsplat.density.ops import Cloud
 from heatsplat.splats import GAUSSIANS
 
+ORIGIN = "intervals_from"  # of a plan that was moved: the step, not rounded, from which intervals are counted
+ROUNDING = 1e-6  # of steps: what came with the step at which a plan is moved has come
+
 
 @dataclass(frozen=True)
 class DensityChange:
@@ -90,7 +93,11 @@ class DensityControl:
         return None
 
     def retime(self, step: int, factor: float) -> None:
-        """Moves the rest of its plan: what was to come n steps after ``step`` comes ``factor`` times n after it."""
+        """Moves the rest of its plan: what was to come n steps after ``step`` comes ``factor`` times n after it.
+
+        What comes at intervals goes on from where it was between two of them: counted from the first step at another interval,
+        the next could follow the last at once.
+        """
 
         def moved(milestone: Any) -> Any:
             if milestone is None:
@@ -102,7 +109,26 @@ class DensityControl:
         now = {name: self._times.get(name, getattr(self, name)) for name in (*self.milestones, *self.intervals)}
         known = {name: now[name] for name in self.intervals if now[name] is not None}
         times = {name: moved(now[name]) for name in self.milestones}
-        self.load_times(times | {name: factor * interval for name, interval in known.items()})
+        times |= {name: factor * interval for name, interval in known.items()}
+        self.load_times(times | {ORIGIN: step + factor * (self._times.get(ORIGIN, 0) - step)})
+
+    def _comes_after(self, name: str, number: int) -> int:
+        """Steps after which what comes at an interval comes for the ``number``-th time."""
+        return math.ceil(self._times.get(ORIGIN, 0) + number * self._interval(name) - ROUNDING)
+
+    def _times_come(self, name: str, steps: float) -> int:
+        """How often what comes at an interval has come after so many steps."""
+        number = math.floor((steps - self._times.get(ORIGIN, 0)) / self._interval(name)) + 1
+        while number > 0 and self._comes_after(name, number) > steps:
+            number -= 1
+        return max(number, 0)
+
+    def _comes(self, name: str, step: int) -> bool:
+        """Whether what comes at an interval comes with a step, counted from 0."""
+        return step + 1 == self._comes_after(name, self._times_come(name, step + 1))
+
+    def _interval(self, name: str) -> float:
+        return max(self._times.get(name, getattr(self, name)), self.shortest)
 
     def times(self) -> dict[str, Any]:
         """Plain numbers for a checkpoint, from which ``load_times`` restores a plan that was moved; empty if it was not."""

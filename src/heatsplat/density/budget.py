@@ -140,6 +140,7 @@ class Budget(DensityControl):
         self.remove_at, self.remove_by = tuple(remove_at), remove_by
         self.split = split or LongAxisSplit()
         self.steps_of_pass = 1
+        self._first = start // every  # event of growth, by its number, which a plan that is moved leaves as it is
 
     def prepare(self, scene: SceneData, modality: str) -> None:
         """Takes the number of training views, their pixels and, unless given, their noise (that of the first modality)."""
@@ -181,13 +182,13 @@ class Budget(DensityControl):
 
     def _event(self, step: int) -> int | None:
         """The event of growth, counted from 0, at or next after a step; None after the last one."""
-        number = max(step, self.start) // self.every
-        return number if (number + 1) * self.every - 1 < self.stop else None
+        number = self._times_come("every", max(step, self.start))
+        return number if self._comes_after("every", number + 1) <= self.stop else None
 
     def _growth_in(self, step: int) -> int | None:
         """Steps from here to the next event of growth, 0 where it is now; None after the last one."""
         number = self._event(step)
-        return None if number is None else (number + 1) * self.every - 1 - step
+        return None if number is None else self._comes_after("every", number + 1) - 1 - step
 
     def _removal_in(self, step: int) -> int | None:
         """Steps from here to the next removal, 0 where it is now; None after the last one."""
@@ -295,8 +296,8 @@ class Budget(DensityControl):
 
     def _share(self, step: int) -> float:
         """Of the Gaussians that are missing, the share that comes at the event of this step."""
-        first, number = self._event(0), self._event(step)
-        last = self.stop // self.every - 1
+        first, number = self._first, self._event(step)
+        last = self._times_come("every", self.stop) - 1
         before, after = (self.curve((done - first) / (last - first + 1)) for done in (number, number + 1))
         return 1.0 if number == last else (after - before) / (1 - before)
 

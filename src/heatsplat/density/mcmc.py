@@ -76,7 +76,7 @@ class MCMC(DensityControl):
     def refine(self, cloud: Cloud, step: int, extent: float, generator: torch.Generator) -> DensityChange | None:
         trained = not cloud.is_held("means")
         change = None
-        if self.start <= step < self.stop and (step + 1) % self.every == 0:
+        if self.start <= step < self.stop and self._comes("every", step):
             change = self._relocate(cloud, step, generator)
         if self.noise > 0 and trained:
             self._wander(cloud, extent, generator)

@@ -132,12 +132,12 @@ class MultiviewGate(Adaptive):
 
     def _grows(self, step: int) -> bool:
         """Whether the next refinement is one of growth, not a late pruning."""
-        return step < self.stop // self.every * self.every
+        return step < self._comes_after("every", self._times_come("every", self.stop))
 
     def _next(self, step: int) -> int | None:
         """Steps that are done at the next refinement, that of ``step`` included; None after the last."""
         if self._grows(step):
-            return -(-max(step + 1, self.start + 1) // self.every) * self.every
+            return self._comes_after("every", self._times_come("every", max(step, self.start)) + 1)
         event = self.stop + max(-(-(step + 1 - self.stop) // self.late_every), 1) * self.late_every
         return event if event <= self.late_stop else None
 

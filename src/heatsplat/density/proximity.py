@@ -92,7 +92,7 @@ class Proximity(Adaptive):
     @torch.no_grad()
     def refine(self, cloud: Cloud, step: int, extent: float, generator: torch.Generator) -> DensityChange | None:
         change = super().refine(cloud, step, extent, generator)
-        if not self.start <= step < self.insert_stop or (step + 1) % self.insert_every != 0:
+        if not self.start <= step < self.insert_stop or not self._comes("insert_every", step):
             return change
         added = self._insert(cloud, extent)
         if added == 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +23,8 @@ NAMED = 3  # frames that a finding names
 # Correlation from which two images are one: 0.998 from a tripod; where cameras move no recording has 0.9 in all frames.
 SAME = 0.95
 MAX_PIXELS = 1500  # of a camera that stands still
+BLANK = 0.1  # of the contrast of the others, below which a frame shows nothing
+CLEAR = 8.0  # contrast in noise from which frames are compared so
 COARSE = 64  # pixels of the shorter side of images whose edges are compared
 # Points and frames from which it can be told what all points do from frame to frame.
 MIN_POINTS, MIN_FRAMES = 40, 5
@@ -116,8 +119,23 @@ class Material:
     @cached_property
     def contrast(self) -> float:
         """Standard deviation of what the images show."""
-        spread = [known.std() for f in range(len(self.images)) if len(known := self.known(f)) > 1]
-        return max(float(torch.stack(spread).median()) if spread else 0.0, self.noise, 1e-9)
+        spread = [own for own in self._spread if own is not None]
+        return max(statistics.median_low(spread) if spread else 0.0, self.noise, 1e-9)
+
+    @cached_property
+    def blank(self) -> list[int]:
+        """Frames of ``images`` that have one level all over, but for noise where the others show the scene."""
+        least = BLANK * self.contrast if self.contrast >= CLEAR * self.noise else 0.0
+        return [f for f, own in enumerate(self._spread) if own is not None and (own == 0 or own < least)]
+
+    @cached_property
+    def _spread(self) -> list[float | None]:
+        """Standard deviation of the pixels of each frame that count, exactly 0 of equal ones; None where fewer than two do."""
+        known = (self.known(f) for f in range(len(self.images)))
+        return [
+            None if len(values) < 2 else 0.0 if values.min() == values.max() else float(values.std())
+            for values in known
+        ]
 
     @cached_property
     def tracks(self) -> Tracks | None:

@@ -164,7 +164,8 @@ def reason_of(folder: Path) -> str:
     """Why a run has no result: the last line of its FAILED file that names an error, since Hydra adds lines of its own."""
     if not (folder / FAILED).exists():
         return "not finished"
-    lines = [line.strip() for line in (folder / FAILED).read_text(encoding="utf-8").splitlines() if line.strip()]
+    told = (folder / FAILED).read_text(encoding="utf-8", errors="replace")
+    lines = [line.strip() for line in told.splitlines() if line.strip()]
     named = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)]
     return (named or lines or ["failed"])[-1]
 

@@ -222,8 +222,7 @@ def _died(job: Job, error: Exception) -> JobReturn:
     reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
     log.error("#%d died: %s", job.number, reason)
     if not (job.folder / FAILED).exists():
-        job.folder.mkdir(parents=True, exist_ok=True)
-        (job.folder / FAILED).write_text(reason + "\n")
+        write_atomically(job.folder / FAILED, reason + "\n")
     failed = JobReturn(overrides=job.overrides, status=JobStatus.FAILED)
     failed.return_value = error
     return failed

@@ -54,6 +54,7 @@ def _gains(material: Material) -> float | None:
     points = torch.where(used, points - torch.where(used, points, torch.nan).nanmean(dim=0), torch.nan)
     own = known - known.nanmean(dim=0)
     kept = used.sum(0) >= MIN_POINTS // 2
+    kept[material.blank] = False
     own, points = own[:, kept], points[:, kept]
     times = None if material.chosen_times_s is None else material.chosen_times_s[kept]
     gain = _gain(own, points)

@@ -7,12 +7,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.contracts import evenly_spread
-from heatsplat.doctor.base import Check, Finding, Material, some
+from heatsplat.doctor.base import CLEAR, Check, Finding, Material, some
 from heatsplat.physics.defects import dead_pixels
 
 BLURRED = 0.7  # of the sharpness of the frames around
 DEAD_FRAMES = 8  # from which dead pixels are told
-CLEAR = 8.0  # contrast in noise from which sharpness can be told
 
 
 def find(material: Material) -> list[Finding]:
@@ -24,7 +23,8 @@ def find(material: Material) -> list[Finding]:
     sharp = [_sharpness(*_filled(material, f, dead), material.noise) for f in range(len(material.images))]
     sharp = torch.tensor(sharp).double()
     around = torch.stack([sharp[max(0, f - 4) : f + 5].nanmedian() for f in range(len(sharp))])
-    worst = [f for f in range(len(sharp)) if float(sharp[f]) < BLURRED * float(around[f])]
+    seen = [f for f in range(len(sharp)) if f not in material.blank]
+    worst = [f for f in seen if float(sharp[f]) < BLURRED * float(around[f])]
     if not worst:
         return []
     names = [material.name(f) for f in worst]

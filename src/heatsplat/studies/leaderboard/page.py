@@ -20,6 +20,7 @@ from heatsplat.studies.leaderboard.standings import (
     Entry,
     Standings,
     beside_reference,
+    least_told,
     mean_costs,
     spread_of,
     summary,
@@ -62,6 +63,7 @@ def page(found: Standings, board: Board, folder: Path | None) -> str:
         "sizes": board.sizes,
         "note": " ".join(filter(None, (board.note, found.note))),
         "spread": spread_of(entries, board),
+        "least": least_told(entries, board),
         "scenes": [
             {"name": name, "shows": board.protocol["scenes"].get(name, {}).get("shows", "a recording"),
              "pictures": _pictures(name, found, board)}

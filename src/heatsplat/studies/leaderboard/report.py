@@ -16,6 +16,7 @@ from heatsplat.studies.leaderboard.standings import (
     Entry,
     Standings,
     beside_reference,
+    least_told,
     mean_costs,
     spread_of,
     standings,
@@ -65,7 +66,8 @@ def markdown(found: Standings, board: Board) -> str:
         "",
         f"Cells: {board.score} ({DEFINITIONS[board.score].unit}) on held-out views, mean over seeds, and the range of ranks in "
         f"parentheses: {TIES} "
-        f"{spread_of(entries, board)} `{_beside(board)}` is {_what_is_beside(board)}, over the scenes on which both ran.",
+        f"{spread_of(entries, board)} `{_beside(board)}` is {_what_is_beside(board)}, over the scenes on which both ran"
+        f"{least_told(entries, board)}.",
         "",
     ]
     for track in board.tracks:

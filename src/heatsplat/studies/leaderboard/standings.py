@@ -20,6 +20,7 @@ from heatsplat.io.command_lines import as_dict
 from heatsplat.io.files import read_json_object, write_atomically
 from heatsplat.io.recorded import OVERRIDES, told_of
 from heatsplat.io.results import METRICS_FILE, RunResults
+from heatsplat.metrics.definitions import DEFINITIONS
 from heatsplat.studies.finished import ran_on, reason_of
 from heatsplat.studies.leaderboard.earlier import EarlierSeeds, Place, add_earlier, sentence
 from heatsplat.studies.leaderboard.plan import Board
@@ -345,19 +346,35 @@ def beside_reference(entries: Sequence[Entry], board: Board) -> dict[tuple[str, 
     """(method, track) -> its score beside the reference's, over the scenes that both ran on, and their number; a method without
     such a scene is left out.
 
-    Of errors that is the geometric mean of the ratios; of a score of which more is better, the mean of the differences.
+    Of errors that is the geometric mean of the ratios, those below ``least_error`` taken for that; of a score of which more is
+    better, the mean of the differences.
     """
     found: dict[tuple[str, str], list[float]] = {}
+    least = least_error(board)
     for scene, track in dict.fromkeys((entry.scene, entry.track) for entry in entries):
         means = {e.method: e.mean(board.score) for e in entries if (e.scene, e.track) == (scene, track)}
-        own = {method: mean for method, mean in means.items() if mean is not None and (board.higher or mean > 0)}
+        own = {method: mean for method, mean in means.items() if mean is not None}
         for method, mean in own.items():
             if board.reference in own:
                 reference = own[board.reference]
-                beside = mean - reference if board.higher else math.log(mean / reference)
+                beside = mean - reference if board.higher else math.log(max(mean, least) / max(reference, least))
                 found.setdefault((method, track), []).append(beside)
     means = {key: (statistics.fmean(values), len(values)) for key, values in found.items()}
     return means if board.higher else {key: (math.exp(mean), count) for key, (mean, count) in means.items()}
+
+
+def least_error(board: Board) -> float:
+    """What errors below it count as in ratios, half of the last digit that tables show: one of zero, as of renders that are the
+    truth, would hide all other scenes of its method, or of all methods where it is the reference's."""
+    return 0.5 * 10.0 ** -DEFINITIONS[board.score].digits
+
+
+def least_told(entries: Sequence[Entry], board: Board) -> str:
+    """A clause on that, where some error is below it; else nothing."""
+    least, unit = least_error(board), DEFINITIONS[board.score].unit
+    means = (entry.mean(board.score) for entry in entries)
+    small = not board.higher and any(mean is not None and mean < least for mean in means)
+    return f"; errors below {least:g}{f' {unit}' if unit else ''} count as that" if small else ""
 
 
 def mean_costs(entries: Sequence[Entry | None]) -> dict[str, float | None]:
