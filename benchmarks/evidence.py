@@ -213,30 +213,6 @@ Nothing else changes. The file states:
 `thermal/` or `sensors/`. `tests/effects/test_off_is_absent.py` needs a case for each effect, to check that nothing of it
 remains when it is off.
 """
-# What rules changed since verdicts say by which they were made (``Outcome.rules``), oldest first; RULES is their number.
-RULES = 2
-OLDER = "The tables below are of verdicts by earlier rules, which changed twice (the two arrows):"
-NEWEST = "The tables below are of verdicts by these rules, which changed twice (the two arrows):"
-CHANGES = """
-1. Normals leave out points of other surfaces, harmonics give way to mirrors, falloffs have to explain what harmonics do, heat in
-   doubt gives way to a camera where a curve was asked for, and parts of a balance, patterns, curves and vignetting under the sky
-   are absent only for a reason. Made without `drawn_440` to `drawn_479`, but for one: a rule that ruled out vignetting under the
-   sky had 88.0 % right there and 1.4 % wrong, and was taken back for its one error.
-2. Scenes hold still whose left-out images no course predicts, contrasts tell of a flow beside a source, and relaxation is certain
-   that no camera explains. Made without `drawn_480` to `drawn_519`, on which they change nothing: three of its scenes seem
-   driven, of which two have no common course and one has too few contrasts that stand out of the noise.
-
-Of 1,000 verdicts on each set (tiny, seed as the number; 0 and 20 for presets):
-
-| set | right % | cannot be told % | wrong % |
-|---|---|---|---|
-| `drawn_300` to `drawn_339` | 87.3 → 88.7 → 89.8 | 10.8 → 9.9 → 8.8 | 1.9 → 1.4 → 1.4 |
-| `drawn_340` to `drawn_379` | 89.0 → 90.1 → 90.2 | 9.7 → 8.7 → 8.6 | 1.3 → 1.2 → 1.2 |
-| `drawn_400` to `drawn_439` | 87.1 → 88.6 → 89.7 | 12.0 → 10.9 → 9.8 | 0.9 → 0.5 → 0.5 |
-| `drawn_440` to `drawn_479` | 87.2 → 88.0 → 88.7 | 11.5 → 10.7 → 10.0 | 1.3 → 1.3 → 1.3 |
-| `drawn_480` to `drawn_519` (second arrow) | 91.1 → 91.1 | 7.4 → 7.4 | 1.5 → 1.5 |
-| the presets, two recordings each | 96.0 → 96.2 → 96.9 | 3.6 → 3.5 → 2.8 | 0.4 → 0.3 → 0.3 |
-"""
 PICTURE = "verdicts_by_strength.png"
 STRENGTH_NOTE = f"""Do the wrong and the undecided verdicts matter? Each effect was taken out of the truth of its scene
 (`benchmarks/without.py`) and the scene was filmed again without noise. *Strength* is the root mean square of the difference
@@ -276,7 +252,6 @@ class Outcome:
         seconds: of processor time that deciding took.
         conditions: in which it was recorded.
         strengths: of the effects that it shows, by name (``benchmarks.strengths``); of scenes that are drawn at random only.
-        rules: how many changes of the rules the verdicts had seen (``RULES``).
     """
 
     scene: str
@@ -287,7 +262,6 @@ class Outcome:
     seconds: float
     conditions: tuple[str, ...] = ()
     strengths: Mapping[str, float] = field(default_factory=dict)
-    rules: int = RULES
 
     @property
     def found(self) -> frozenset[str]:
@@ -422,7 +396,6 @@ def _plain(outcome: Outcome, settings: Sequence[str]) -> dict[str, Any]:
 def _read(path: Path) -> Outcome:
     said = json.loads(path.read_text(encoding="utf-8"))
     said.pop("settings", None)
-    said.setdefault("rules", 0)  # written before verdicts said so
     verdicts = {name: Verdict(**verdict) for name, verdict in said["verdicts"].items()}
     sets = {"present": frozenset(said["present"]), "conditions": tuple(said["conditions"])}
     return Outcome(**{**said, "verdicts": verdicts, **sets})
@@ -448,11 +421,6 @@ def written(
         for effect in CATALOGUE
     ]  # fmt: skip
     lines = [TITLE, "", made_by, HEAD, "## The catalogue\n", *markdown_table(COLUMNS, rows)]
-    lines += [
-        "\n## Changes of the rules\n",
-        OLDER if any(one.rules < RULES for one in outcomes) else NEWEST,
-        CHANGES.rstrip(),
-    ]
     for size in dict.fromkeys(outcome.size for outcome in outcomes):
         for which, wanted in ((size, False), (f"{size}, on recordings not used to set thresholds", True)):
             these = [outcome for outcome in outcomes if outcome.size == size and (outcome.seed in unseen) == wanted]
