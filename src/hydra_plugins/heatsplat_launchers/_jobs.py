@@ -220,6 +220,7 @@ def _finished(job: Job) -> JobReturn | None:
 def _died(job: Job, error: Exception) -> JobReturn:
     """The result of a job whose process did not live to return one, with the reason in its folder."""
     reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    reason = reason.encode("utf-8", "backslashreplace").decode()  # neither logs nor files hold surrogates
     log.error("#%d died: %s", job.number, reason)
     if not (job.folder / FAILED).exists():
         write_atomically(job.folder / FAILED, reason + "\n")
