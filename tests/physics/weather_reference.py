@@ -10,9 +10,10 @@ import torch
 from scipy.integrate import odeint
 
 from heatsplat.contracts import Weather
+from heatsplat.kernels.heat_balance import COVERS_MM
 from heatsplat.physics.sky import sky_temperature_k
 from heatsplat.physics.surfaces import Drivers, Surface, power_excess
-from heatsplat.physics.wetness import COVERS_MM, drying_mm_s_k, vapour_k
+from heatsplat.physics.wetness import drying_mm_s_k, vapour_k
 from heatsplat.training.rng import generator_for
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
