@@ -166,7 +166,8 @@ one rate, with a core, and of infinite depth.
 
 - Sun, sky and wind count from a gain of two standard errors on: a part that is absent loses on held-out observations. Of 91
   that 200 random scenes have, linear balances alone found 70 and missed 10; with full ones 77 are found and two missed, and two
-  more are found that are not there.
+  are found that are not there (one before). On 100 scenes that nobody had looked at, 32 of 34 are found, none is missed, and
+  none wrongly found.
 - In few frames a part that is there may gain nothing. Sun and sky are absent only if bodies also take a share below the least
   that counts: 0.02 at most on nine random scenes without, 0.11 on one of nine frames whose sunlight gains nothing. What gains
   two standard errors is not absent, however small it is.
