@@ -42,6 +42,11 @@ MEMORY_S = 10.0 * DAY_S  # of the record before the first frame, after which sta
 class FullBalance:
     """P points in F frames as bodies with a core, under the air, light and wind of a record and a sky.
 
+    The balance is that of ``thermal.energy_balance`` (ThermoGS, Eq. 2-5, with a sky), fitted as Levenberg (1944) and Marquardt
+    (1963) do, under Huber's loss (1964) and with what is expected of its numbers.
+
+    **Convention:** float64; series of the record are [T], linear between samples; a frame beyond its ends is at them.
+
     Args:
         weather: the record.
         sky_k: [T] temperature of its sky.
@@ -100,6 +105,7 @@ class FullBalance:
 
     @cached_property
     def _climate(self) -> Climate:
+        """Drivers as ``thermal.surface_drivers`` gives them to a balance in training; effects import no thermal models."""
         weather = self.weather
         forgotten = int((weather.times_s < float(self.times_s.min()) - MEMORY_S).sum())
         kept = slice(min(max(forgotten - 1, 0), len(weather.times_s) - 2), None)
