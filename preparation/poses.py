@@ -547,7 +547,7 @@ class Search:
         return (
             f"no cameras could be found: frames have {np.median(thermal):.0f} features (median) and overlap with "
             f"{np.median([partners[copy] for copy in self.name_of]):.0f} others. More overlap between frames helps, and "
-            "photos of a camera beside (poses=rgb); or bring a sparse model or transforms.json of another tool"
+            "photos of a camera beside (poses=rgb); or bring the cameras of another tool (poses=given)"
         )
 
 

@@ -11,7 +11,7 @@ import os
 import shlex
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from heatsplat.datamodules.bounds import BOUNDS_FILE
 from heatsplat.datamodules.colmap import FRAMES_FILE, WORLD_FILE
 from heatsplat.datamodules.formats.images import SUFFIXES, read_grey
 from heatsplat.datamodules.formats.radiometric import Calibration
+from heatsplat.datamodules.side_files import read_table
 from heatsplat.datamodules.timestamps import instant
 from heatsplat.doctor.base import some
 from heatsplat.io.files import read_json_object, write_atomically
@@ -35,7 +36,7 @@ from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import InputUncertainty
 from heatsplat.preparation.devices import devices_of
 from heatsplat.preparation.fingerprint import fingerprint
-from heatsplat.preparation.frame import ThermalFrame
+from heatsplat.preparation.frame import Position, ThermalFrame
 from heatsplat.preparation.target import PARTIAL
 
 QUANTILES = np.linspace(0.0, 1.0, 41)
@@ -220,6 +221,25 @@ def write_world(target: Path, metres_per_unit: float | None, axes: str | None = 
     else:
         world = {"metres_per_unit": metres_per_unit} | ({"axes": axes} if axes else {})
         write_atomically(path, json.dumps(world) + "\n")
+
+
+def write_places(target: Path, places: Mapping[str, Sequence[float]]) -> None:
+    """Puts where cameras were found to stand in the place of where the camera's files say so, in a folder's table of frames.
+
+    Args:
+        target: the prepared folder, with its frames.csv.
+        places: name of an image -> latitude and longitude in degrees (WGS 84), altitude in metres.
+    """
+    table = read_table(target / FRAMES_FILE)
+    found = []
+    for _, cells in table.rows:
+        row = dict(zip(table.columns, cells, strict=True))
+        row |= {part.name: "" for part in fields(Position)}  # none of two kinds of places in one table
+        place = places.get(row["file"])
+        if place is not None:
+            row |= dict(zip(("latitude_deg", "longitude_deg", "altitude_m"), map(float, place), strict=True))
+        found.append(row)
+    write_csv(target / FRAMES_FILE, found)
 
 
 def write_bounds(target: Path, low: float, high: float) -> None:

@@ -1,15 +1,30 @@
 """Cameras of other tools, taken as they are: what was given is what the prepared scene has."""
 
+import csv
 import json
 
 import numpy as np
 import pytest
+import torch
+from aligned import (
+    METASHAPE,
+    WGS_84,
+    calibration,
+    camera,
+    east_north_up_at,
+    geocentric,
+    in_chunk,
+    transform_of,
+    write_metashape,
+    write_pix4d,
+)
 from recordings import write_flir, write_images
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import read_model, write_model
 from heatsplat.doctor.base import material_of
+from heatsplat.export.place import place_of
 from heatsplat.preparation.given_poses import GivenPoses
 from heatsplat.preparation.prepare import prepare
 
@@ -99,7 +114,7 @@ def test_what_does_not_belong_to_the_recording_is_refused_by_name(tmp_path):
             prepare(str(source), tmp_path / "scene", **PLAIN, poses=GivenPoses(str(tmp_path / "tool")))
 
     write_images(tmp_path / "tool", {})
-    refused("neither a COLMAP model .sparse/0. nor a transforms.json")
+    refused("poses.model=.*tool holds none of them: the folder of a COLMAP model .sparse/0. or")
     model = tmp_path / "tool" / "sparse" / "0"
     points = np.zeros((4, 3)), np.zeros((4, 3))
     write_model(model, {"a/left_1.png": pose(0)}, [FISHEYE], *points)
@@ -151,3 +166,67 @@ def test_greys_that_become_temperatures_leave_no_image_under_the_same_name(tmp_p
         images = {p.name for p in (tmp_path / "scene" / "images").glob("*") if p.suffix != ".json"}
         assert images == {f"f{i}.{ending}" for i in range(3)}
         assert (tmp_path / "scene" / "temperature_bounds.json").exists() == (bounds is not None)
+
+
+def test_cameras_of_metashape_place_the_scene_on_the_earth_by_its_reference(tmp_path):
+    warp = pytest.importorskip("rasterio.warp", reason="rasterio is not installed (pip install -e '.[dev]')")
+    source = write_flir(tmp_path / "files", 6)  # whose own fixes are 26 km away
+    place, viewmats = np.array([51.2, 7.25, 180.0]), [pose(i) for i in range(5)]
+    axes, centers = east_north_up_at(place), np.stack([np.linalg.inv(viewmat)[:3, 3] for viewmat in viewmats])
+    shift, world = geocentric(place), np.eye(4)
+    world[:3, :3], world[:3, 3] = axes, -axes @ shift
+    poses = [in_chunk(viewmat @ world, np.eye(3), shift, 3.0) for viewmat in viewmats]
+    cameras = [camera(i, f"IR_{i:04d}", chunk) for i, chunk in enumerate(poses)]
+    cameras.append(camera(5, "IR_0005", poses[0], 'sensor_id="0" enabled="false"'))
+    given = tmp_path / "tool" / "cameras.xml"
+    write_metashape(given, cameras, [calibration(METASHAPE)], transform_of(np.eye(3), shift, 3.0), WGS_84)
+    for model in (given, given.parent):
+        page = prepare(str(source), tmp_path / "scene", **PLAIN, poses=GivenPoses(str(model)))
+    text = page.read_text()
+    assert "5 of 6 frames have a camera" in text and "- IR_0005: it is disabled in Metashape" in text
+    assert "World: east, north, up in metres of the first camera" in text and "It has no points" in text
+    assert json.loads((tmp_path / "scene" / "world.json").read_text()) == {
+        "metres_per_unit": 1.0,
+        "axes": "east, north, up",
+    }
+    rows = {row["file"]: row for row in csv.DictReader((tmp_path / "scene" / "frames.csv").open())}
+    assert rows["IR_0005.tiff"]["latitude_deg"] == "" and rows["IR_0005.tiff"]["time"]
+    data = Colmap(root=str(tmp_path / "scene"), random_points=50, split="all").scene
+    found = place_of(data, "auto")
+    at = torch.stack([frame.camera.center for frame in data.train.frames])
+    (easting,), (northing,) = warp.transform("EPSG:4326", found.crs, [7.25], [51.2])
+    away = found(at) - torch.tensor([easting, northing, 180.0], dtype=torch.float64)
+    numbers = [int(frame.name[3:7]) for frame in data.train.frames]
+    assert np.abs(away.numpy() - centers[numbers]).max() < 0.02  # of decimetres, and grid north is 1.4 degrees off
+    latitudes = [float(rows[f"IR_{i:04d}.tiff"]["latitude_deg"]) for i in range(5)]
+    np.testing.assert_allclose(np.array(latitudes) - 51.2, centers[:, 1] / 111_250.0, atol=1e-9)
+
+
+def test_cameras_of_pix4d_and_files_of_none_of_them(tmp_path):
+    source = write_flir(tmp_path / "files", 3)
+    folder = tmp_path / "params"
+    path = write_pix4d(folder, {f"IR_{i:04d}.JPG": pose(i) for i in range(2)})
+    page = prepare(str(source), tmp_path / "scene", **PLAIN, poses=GivenPoses(str(folder)))
+    assert (
+        "2 of 3 frames have a camera" in page.read_text() and "- IR_0002: the model has no camera" in page.read_text()
+    )
+    np.testing.assert_allclose(read_model(tmp_path / "scene").viewmats[1], pose(1), atol=1e-9)
+    assert not (tmp_path / "scene" / "world.json").exists()
+
+    def refused(model, said):
+        with pytest.raises(SceneError, match=said):
+            prepare(str(source), tmp_path / "scene", **PLAIN, poses=GivenPoses(str(model)))
+
+    fish = calibration(METASHAPE, kind="spherical")
+    xml = write_metashape(folder / "cameras.xml", [camera(i, f"IR_{i:04d}", pose(i)) for i in range(2)], [fish])
+    refused(
+        folder, "params holds several files of cameras .cameras.xml, flight_calibrated_camera_parameters.txt.; give one"
+    )
+    refused(xml, "cameras.xml: sensor 0: type is spherical, and only frame is read")
+    write_metashape(xml, [camera(0, "IR_0000", None), camera(1, "other", pose(0))], [calibration(METASHAPE)])
+    refused(
+        xml, "cameras.xml has no camera of a frame: of 1 none, such as IR_0000, because it is not aligned in Metashape"
+    )
+    refused(source / "IR_0000.jpg", "poses.model=.*IR_0000.jpg is none of them: the folder of a COLMAP model")
+    refused(tmp_path / "nowhere", "poses.model=.*nowhere does not exist: ")
+    assert path.is_file()
