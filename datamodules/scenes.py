@@ -20,6 +20,7 @@ from heatsplat.contracts import (
     View,
     ViewSet,
     Weather,
+    as_written,
 )
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.physics.units import DAY_S
@@ -73,7 +74,9 @@ class Scenes(SceneDataModule):
     ) -> None:
         super().__init__(root=root, scene=scene, seed=seed)
         if scenes is None or isinstance(scenes, str) or len(scenes) < 2:
-            raise SceneError(f"data.scenes must list two or more scenes, such as [S1, S2, S3]; got {scenes}")
+            raise SceneError(
+                f"data.scenes must list two or more scenes, such as [S1, S2, S3]; got {as_written(scenes)}"
+            )
         if not far > 0:
             raise SceneError(f"data.far must be a positive number of metres, got {far}")
         place = {} if root is None else {"root": root}

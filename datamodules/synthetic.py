@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from heatsplat.contracts import SceneData, SceneError, View, ViewSet, check_option
+from heatsplat.contracts import SceneData, SceneError, View, ViewSet, as_written, check_option
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.formats.colmap import find_model
 from heatsplat.datamodules.nerfstudio import find_transforms
@@ -209,11 +209,11 @@ def _check_times(scene: str, days: int | None, hours: Sequence[float] | None) ->
     if hours is None:
         return
     if scene not in OF_ANY_LENGTH:
-        raise SceneError(f"data.hours={hours}: {yards} know the hour of the day; leave it null elsewhere")
+        raise SceneError(f"data.hours={as_written(hours)}: {yards} know the hour of the day; leave it null elsewhere")
     pair = isinstance(hours, Sequence) and len(hours) == 2 and hours[0] != hours[1] and list(hours) != [24, 0]
     if not pair or not all(isinstance(hour, int | float) and 0 <= hour <= 24 for hour in hours):
         raise SceneError(
-            f"data.hours={hours}: give the first and the last hour in UTC, 0 to 24, such as [20,4] for nights"
+            f"data.hours={as_written(hours)}: give the first and the last hour in UTC, 0 to 24, such as [20,4] for nights"
         )
 
 

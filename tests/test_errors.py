@@ -1,10 +1,11 @@
 """Settings that are of no use are named, with what they must be."""
 
 import math
+import re
 
 import pytest
 
-from heatsplat.errors import SceneError, check_count, check_numbers, check_option, number_in, rounded
+from heatsplat.errors import SceneError, as_written, check_count, check_numbers, check_option, number_in, rounded
 
 
 def test_an_option_that_there_is_not_is_told_those_that_there_are():
@@ -13,6 +14,18 @@ def test_an_option_that_there_is_not_is_told_those_that_there_are():
         check_option("codec", "h265", ("auto", "h264"), SceneError)
     with pytest.raises(ValueError, match="^figures must be one of null, pdf, got 'png'$"):
         check_option("figures", "png", (None, "pdf"))
+
+
+def test_settings_are_told_as_people_write_them():
+    assert as_written([20.0, None, [True, "x"]]) == "[20.0, null, [true, x]]"
+    assert as_written({"a": None, "b": (1, False)}) == "{a: null, b: [1, false]}"
+    for check, said in (
+        (lambda: check_option("codec", None, (True, "h264")), "codec must be one of true, h264, got null"),
+        (lambda: check_numbers("range_c", [20.0, None], 2), "range_c must be a list of 2 numbers, got [20.0, null]"),
+        (lambda: check_count("frames", None), "frames must be a whole number, 1 or more, got null"),
+    ):
+        with pytest.raises(ValueError, match=f"^{re.escape(said)}$"):
+            check()
 
 
 @pytest.mark.parametrize("wrong", ["x", "12", True, None, [1.0], math.nan, math.inf])

@@ -25,7 +25,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from heatsplat.composition import CONF, build, options_of, plain, run_of
-from heatsplat.errors import SceneError, check_count, check_numbers, check_option, counted
+from heatsplat.errors import SceneError, as_written, check_count, check_numbers, check_option, counted
 from heatsplat.explanations import expected, explain, sentence
 from heatsplat.io.command_lines import with_names
 from heatsplat.io.files import size_told, utf8, write_atomically
@@ -364,7 +364,9 @@ def render(config: dict[str, Any], output_dir: Path) -> None:
     check_numbers("fps", config["fps"], error=SceneError, above=0)
     names = [config["images"]] if isinstance(config["images"], str) else config["images"]
     if not isinstance(names, list) or not names:
-        raise SceneError(f"images must be all, or one or a list of recorded, clean and rgb, got {config['images']}")
+        raise SceneError(
+            f"images must be all, or one or a list of recorded, clean and rgb, got {as_written(config['images'])}"
+        )
     keep = checked_unseen("unseen", config["unseen"]) == "keep"
     check_option("codec", config["codec"], CODECS, SceneError)
     check_option("figures", config["figures"], (None, "pdf", "svg"), SceneError)

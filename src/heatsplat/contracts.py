@@ -25,6 +25,7 @@ from torch import Tensor
 # Also under this name, for packages that need torch anyway; what must start without it imports heatsplat.errors.
 from heatsplat.errors import (  # noqa: F401
     SceneError,
+    as_written,
     check_count,
     check_numbers,
     check_option,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Any
 
@@ -15,8 +15,19 @@ class SceneError(ValueError):
 def check_option(name: str, value: Any, known: Iterable[Any], error: type[ValueError] = ValueError) -> None:
     """Raises ``error``, with the values that are known, where an option has another one."""
     if value not in known:
-        options = ("null" if option is None else str(option) for option in known)  # as they are written
-        raise error(f"{name} must be one of {', '.join(options)}, got '{value}'")
+        shown = as_written(value) if value is None or isinstance(value, bool) else f"'{as_written(value)}'"
+        raise error(f"{name} must be one of {', '.join(map(as_written, known))}, got {shown}")
+
+
+def as_written(value: Any) -> str:
+    """A setting for messages, as a configuration and the command line have it: null and true, not None and True."""
+    if value is None or isinstance(value, bool):
+        return "null" if value is None else str(value).lower()
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key}: {as_written(one)}' for key, one in value.items())}}}"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return f"[{', '.join(map(as_written, value))}]"
+    return str(value)
 
 
 def check_numbers(
@@ -29,7 +40,7 @@ def check_numbers(
     """Raises ``error`` where a setting is no finite number ``above`` another, or with ``count`` no list of so many."""
     listed = isinstance(value, Sequence) and not isinstance(value, str)
     numbers = value if listed else [value]
-    shown = list(value) if listed else value
+    shown = as_written(value)
     if not all(is_number(x) for x in numbers) or (count is None) == listed or (listed and len(numbers) != count):
         wanted = "a number" if count is None else f"a list of {count} numbers"
         raise error(f"{name} must be {wanted}, got {shown}")
@@ -40,7 +51,7 @@ def check_numbers(
 def check_count(name: str, value: Any, least: int = 1) -> None:
     """Raises SceneError where an option is no whole number, or less than ``least``."""
     if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise SceneError(f"{name} must be a whole number, {least} or more, got {value}")
+        raise SceneError(f"{name} must be a whole number, {least} or more, got {as_written(value)}")
 
 
 def number_in(text: str) -> float:

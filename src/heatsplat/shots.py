@@ -21,6 +21,7 @@ from heatsplat.contracts import (
     SceneData,
     SceneError,
     View,
+    as_written,
     check_count,
     check_numbers,
     check_option,
@@ -124,7 +125,7 @@ def check_shot(trajectory: str, time: Times | None, view: int | str, count: int)
     if time is not None and len(checked_times(time)) > 2:
         raise SceneError(f"time must be one moment or [start, end], got {list(time)}")
     if not isinstance(view, int | str):
-        raise SceneError(f"view must be the whole number or the file name of a training frame, got {view}")
+        raise SceneError(f"view must be the whole number or the file name of a training frame, got {as_written(view)}")
     check_count("frames", count)
 
 

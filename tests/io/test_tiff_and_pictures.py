@@ -216,6 +216,8 @@ def test_isotherms_and_contours_that_are_none_are_refused_with_the_option():
             SceneError, match=r"isotherm must be \[low, high\] of rising numbers, \[low, null\] for all above"
         ):
             checked_isotherm("isotherm", wrong)
+    with pytest.raises(SceneError, match=r"got \[null, null\]$"):
+        checked_isotherm("isotherm", [None, None])
     for wrong in (0, -1, "5", [], [20, None], True, float("inf")):
         with pytest.raises(SceneError, match="contours must be a distance above 0, such as 5, or a list of values"):
             checked_contours("contours", wrong)

@@ -56,5 +56,5 @@ def test_frames_that_show_nothing_are_thinned_as_without(tmp_path):
 def test_a_choice_among_single_frames_is_refused():
     with pytest.raises(SceneError, match="sharpest=true changes nothing with every=1: give every=15"):
         Reading(sharpest=True)
-    with pytest.raises(SceneError, match="sharpest must be one of True, False, got 'yes'"):
+    with pytest.raises(SceneError, match="sharpest must be one of true, false, got 'yes'"):
         Reading(every=2, sharpest="yes")

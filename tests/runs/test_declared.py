@@ -94,8 +94,8 @@ def test_the_remedies_are_ones():
     ("overrides", "told"),
     [
         ("method=physir thermal.air=5", r"thermal.air must be settings with a _target_ or null, got 5; .* by thermal.air\.\*"),
-        ("method=through_air thermal.air=null", "thermal.air must be settings with a _target_, got None$"),
-        ("method=etgs +callbacks.plateau=true", "callbacks.plateau must be settings with a _target_ or null, got True"),
+        ("method=through_air thermal.air=null", "thermal.air must be settings with a _target_, got null$"),
+        ("method=etgs +callbacks.plateau=true", "callbacks.plateau must be settings with a _target_ or null, got true"),
         ("method=supirgs loss.terms.high_frequency.schedule=linear", "schedule must be settings with a _target_ or null"),
         ("method=ravigs thermal.degrees=3", "thermal.degrees must be settings by name, got 3"),
         ("method=ravigs thermal.degrees.emissivity=abc", "thermal.degrees.emissivity must be a whole number, got abc"),

@@ -453,13 +453,13 @@ def test_kernels_are_not_told_of_threads_that_are_no_number(tmp_path):
     ("key", "value", "told"),
     [
         ("density.start", "abc", "density.start must be a whole number, got abc"),
-        ("density.stop", None, "density.stop must be a whole number, got None"),
+        ("density.stop", None, "density.stop must be a whole number, got null"),
         ("density.every", 2.5, "density.every must be a whole number, got 2.5"),
         ("density.cap_max", math.nan, "density.cap_max must be a whole number, got nan"),
         ("density.multiple", "abc", "density.multiple must be a number or null, got abc"),
         ("density.floor", math.nan, "density.floor must be a number, got nan"),
-        ("thermal.lr_rate", None, "thermal.lr_rate must be a number, got None"),
-        ("optim.length_power", True, "optim.length_power must be a number, got True"),
+        ("thermal.lr_rate", None, "thermal.lr_rate must be a number, got null"),
+        ("optim.length_power", True, "optim.length_power must be a number, got true"),
         ("init.separate", "abc", "init.separate must be true or false, got abc"),
     ],
 )

@@ -165,7 +165,7 @@ def test_a_scene_without_temperatures_is_measured_by_psnr_alone(tmp_path, no_pic
         ({"reference": ["density=adaptive"]}, "give its length too"),
         ({"reference": ["max_steps=3e4"]}, "give its length too, a whole number"),
         ({"psnr_margin_db": "abc"}, "study.psnr_margin_db must be a number, got abc"),
-        ({"mae_margin_c": None}, "study.mae_margin_c must be a number, got None"),
+        ({"mae_margin_c": None}, "study.mae_margin_c must be a number, got null"),
         ({"clock": "wall"}, "study.clock must be one of train_seconds, cpu_seconds, got 'wall'"),
         ({"cases": {"a": ["method=etgs"]}, "seeds": []}, r"study.seeds=\[\] has nothing in it"),
         ({"cases": {"a": ["method=etgs"]}, "lengths": ["long"]}, "study.lengths must be a whole number"),

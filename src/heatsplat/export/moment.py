@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import SceneData, SceneError, View, check_option, is_number, quantile
+from heatsplat.contracts import SceneData, SceneError, View, as_written, check_option, is_number, quantile
 from heatsplat.export.snapshot import Layer, Snapshot
 from heatsplat.geometry.coverage import OPEN, surface_depth
 from heatsplat.geometry.looks import Look
@@ -77,7 +77,7 @@ def checked_box(name: str, box: Any) -> Tensor | None:
         isinstance(box, list) and len(box) == 2 and all(isinstance(corner, list) and len(corner) == 3 for corner in box)
     )
     if not places or not all(is_number(x) for corner in box for x in corner):
-        raise SceneError(f"{name} must be two opposite corners [[x, y, z], [x, y, z]], got {box}")
+        raise SceneError(f"{name} must be two opposite corners [[x, y, z], [x, y, z]], got {as_written(box)}")
     low, high = torch.tensor(box, dtype=torch.float64).sort(dim=0).values
     if not bool((low < high).all()):
         raise SceneError(f"{name}={box} has no volume: its corners must differ in x, y and z")

@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw, ImageFont
 
-from heatsplat.contracts import SceneError, ThermalRange, is_number
+from heatsplat.contracts import SceneError, ThermalRange, as_written, is_number
 
 THERMAL = "inferno"
 ERROR = "RdBu_r"  # red: rendered too warm, blue: too cold
@@ -60,7 +60,7 @@ def checked_colormap(name: str, value: str) -> str:
     """A name of a matplotlib map. Raises SceneError with the option's ``name``, and names that are alike, where there is none."""
     if value not in matplotlib.colormaps:
         alike = difflib.get_close_matches(str(value), matplotlib.colormaps) or ["gray", "turbo", "viridis"]
-        raise SceneError(f"{name}={value} is no map of matplotlib, as {', '.join([THERMAL, *alike])} are")
+        raise SceneError(f"{name}={as_written(value)} is no map of matplotlib, as {', '.join([THERMAL, *alike])} are")
     return value
 
 
@@ -73,7 +73,8 @@ def checked_isotherm(name: str, value: Any) -> tuple[float, float] | None:
     low, high = (open_end if end is None else end for open_end, end in zip((-np.inf, np.inf), ends, strict=True))
     if not all(end is None or is_number(end) for end in ends) or not low < high or low == -high == -np.inf:
         raise SceneError(
-            f"{name} must be [low, high] of rising numbers, [low, null] for all above, or [null, high] for all below; got {value}"
+            f"{name} must be [low, high] of rising numbers, [low, null] for all above, or [null, high] for all below; got "
+            f"{as_written(value)}"
         )
     return float(low), float(high)
 
@@ -85,7 +86,7 @@ def checked_contours(name: str, value: Any) -> float | list[float] | None:
         return value
     if not (is_number(value) and value > 0):
         raise SceneError(
-            f"{name} must be a distance above 0, such as 5, or a list of values, such as [20, 25], got {value}"
+            f"{name} must be a distance above 0, such as 5, or a list of values, such as [20, 25], got {as_written(value)}"
         )
     return value
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from heatsplat.composition import copied_settings, module_settings, overlap
-from heatsplat.contracts import SceneError, check_count, check_option
+from heatsplat.contracts import SceneError, as_written, check_count, check_option
 from heatsplat.effects import assembly
 from heatsplat.io.command_lines import keys_of
 from heatsplat.io.settings import at, walk
@@ -34,7 +34,9 @@ def check_threads(threads: int | None) -> None:
     """Raises SceneError for a number of threads that a machine like this one is not given; None is all cores."""
     most = MAX_THREADS_PER_CORE * (os.cpu_count() or 1)
     if threads is not None and not (isinstance(threads, int) and 1 <= threads <= most):
-        raise SceneError(f"threads must be 1 to {most} on this machine, or null for all cores, got {threads}")
+        raise SceneError(
+            f"threads must be 1 to {most} on this machine, or null for all cores, got {as_written(threads)}"
+        )
 
 
 def checked(config: dict[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from numbers import Real
 from typing import Any, get_args
 
 from heatsplat.composition import choices_of, overlap, setters_of
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, as_written
 from heatsplat.effects import assembly
 from heatsplat.io.command_lines import key_of
 from heatsplat.io.settings import walk
@@ -155,7 +155,7 @@ def _other_kind(key: str, value: Any, kinds: frozenset[str], config: Mapping[str
         return f"{key}{setters} has no _target_, and {option} has no such part: {remedy}"
     wanted = " or ".join(words for kind, words in KINDS.items() if kind in kinds)
     single = f"; single ones are set by {key}.*" if "part" in kinds and value is not None else ""
-    return f"{key} must be {wanted}, got {value}{single}"
+    return f"{key} must be {wanted}, got {as_written(value)}{single}"
 
 
 def _unknown(key: str, target: str, names: frozenset[str], config: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, as_written
 from heatsplat.io.files import write_atomically
 from heatsplat.runs.run import Trained
 from heatsplat.training.checkpoints import CheckpointFiles
@@ -45,7 +45,7 @@ def write_levels(
     except TypeError:
         increasing = False
     if not increasing or len(wanted) == 0:
-        raise SceneError(f"levels_c must be increasing numbers of °C above 0, got {levels_c}")
+        raise SceneError(f"levels_c must be increasing numbers of °C above 0, got {as_written(levels_c)}")
     module, written, found = trained.module, [], []
     for number, level in enumerate(merging.levels(module, [float(level) for level in wanted])):
         found.append(level.found | {"checkpoint": f"lod_{number}.ckpt"})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from heatsplat.contracts import SceneError, check_count, check_option
+from heatsplat.contracts import SceneError, as_written, check_count, check_option
 
 
 def listed(value: Any) -> list[Any]:
@@ -31,7 +31,7 @@ def non_empty(key: str, value: Any) -> list[Any]:
         SceneError: there is none.
     """
     if not (found := listed(value)):
-        raise SceneError(f"{key}={value} has nothing in it: give at least one value")
+        raise SceneError(f"{key}={as_written(value)} has nothing in it: give at least one value")
     return found
 
 

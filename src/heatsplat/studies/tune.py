@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError, check_count, check_numbers, check_option, is_number
+from heatsplat.contracts import SceneError, as_written, check_count, check_numbers, check_option, is_number
 from heatsplat.io.files import write_atomically
 from heatsplat.io.results import RunResults
 from heatsplat.io.tables import markdown_table, number, over_seeds, write_csv
@@ -230,7 +230,7 @@ def _checked(
     for name, case in chosen.items():
         good = isinstance(case, Mapping) and set(case) == CASE and isinstance(case["knobs"], Mapping)
         if not good or not case["knobs"]:
-            raise SceneError(f"study.cases.{name} has the keys scene and knobs, both filled, got {case}")
+            raise SceneError(f"study.cases.{name} has the keys scene and knobs, both filled, got {as_written(case)}")
         for key, values in case["knobs"].items():
             _distribution(name, key, values)
     return {name: {"scene": listed(case["scene"]), "knobs": case["knobs"]} for name, case in chosen.items()}
@@ -248,7 +248,8 @@ def _distribution(method: str, key: str, values: Any) -> Any:
             kind = distributions.IntDistribution if whole else distributions.FloatDistribution
             return kind(low, high, log=low > 0)
     raise SceneError(
-        f"study.cases.{method}.knobs.{key}={values}: give [lowest, highest], or {{among: [values]}}, such as [1e-4, 1e-2]"
+        f"study.cases.{method}.knobs.{key}={as_written(values)}: give [lowest, highest], or {{among: [values]}}, such as "
+        "[1e-4, 1e-2]"
     )
 
 
