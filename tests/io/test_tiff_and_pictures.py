@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from heatsplat.contracts import SceneError, ThermalRange
+from heatsplat.io import pictures
 from heatsplat.io.pictures import (
     BAR,
     GAP,
@@ -177,13 +178,23 @@ def test_an_isotherm_is_green_in_the_picture_and_at_the_bar_and_its_share_is_tol
     ):
         bar = Bar(0.0, 10.0, "°C", isotherm=checked_isotherm("isotherm", given))
         panel = image_panel(torch.from_numpy(values)[..., None], "x", bar)
-        assert panel.title == f"x · green: {100 * share:.1f} % {words}"
+        assert panel.title == f"green: {100 * share:.1f} % {words} · x"
         green = (panel.image == MARKED).all(-1)
         assert green.sum() == round(199 * share)
         plain = image_panel(torch.from_numpy(values)[..., None], "x", Bar(0.0, 10.0, "°C"))
         assert (panel.image[~green] == plain.image[~green]).all()
         barred = (compose([Panel(plain.image, "", bar)]) == MARKED).all(-1)
         assert set(barred.sum(1)) == ({0, BAR} if share else {0})  # the bar alone
+
+
+def test_a_picture_of_320_pixels_has_the_whole_share_of_an_isotherm_in_its_title(monkeypatch):
+    written = []
+    cut = pictures._fit
+    monkeypatch.setattr(pictures, "_fit", lambda text, width: written.append(cut(text, width)) or written[-1])
+    bar = Bar(0.0, 10.0, "°C", isotherm=(-12.25, 30.75))
+    panel = image_panel(torch.full((256, 320, 1), 5.0), "temperature as recorded by the camera", bar)
+    compose([panel], "90.0 s   DJI_20240806173449_0008_T")
+    assert any("green: 100.0 % between −12.25 and 30.75 °C" in text for text in written)
 
 
 def test_contour_lines_run_where_the_value_is_and_end_where_none_is_known(tmp_path):

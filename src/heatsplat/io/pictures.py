@@ -218,7 +218,8 @@ def image_panel(image: Any, title: str, bar: Bar, thermal_range: ThermalRange | 
     colours, marked = colorize(values, bar.low, bar.high, bar.colormap), bar.marks(values)
     colours[marked] = MARKED
     isotherm = bar.isotherm and f"green: {100 * marked.sum() / max(np.isfinite(values).sum(), 1):.1f} % {bar.marked}"
-    told = " · ".join(part for part in (title, isotherm, beyond(values, bar)) if part)
+    # What was asked for first: a narrow picture cuts off the end of its title.
+    told = " · ".join(part for part in (isotherm, title, beyond(values, bar)) if part)
     return Panel(colours, told, bar.of(values), lines=contour_lines(values, bar.levels()))
 
 
