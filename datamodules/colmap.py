@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from heatsplat.contracts import SceneData, SceneError, ThermalRange, check_option
+from heatsplat.contracts import SceneData, SceneError, ThermalRange, check_option, table_lines
 from heatsplat.datamodules.base import CELSIUS, Counts, SceneDataModule
 from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
 from heatsplat.datamodules.formats.colmap import find_model, nearly_model, read_model
@@ -19,7 +20,7 @@ from heatsplat.datamodules.formats.radiometric import has_temperatures, read_cel
 from heatsplat.datamodules.frame_times import FRAMES_FILE, FrameTimes
 from heatsplat.datamodules.points import random_points, told_random
 from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames, named_as_files
-from heatsplat.datamodules.side_files import finite, json_object
+from heatsplat.datamodules.side_files import finite, json_object, read_text
 
 # Of a prepared folder: metres_per_unit of the sparse model, and its axes, where GPS has told them.
 WORLD_FILE = "world.json"
@@ -30,8 +31,8 @@ def _positions(folder: Path) -> Path | None:
     """The first table beside the scene that has a latitude."""
     for path in (folder / FRAMES_FILE, folder / META_FILE, folder.parent / META_FILE):
         if path.is_file():
-            with open(path, encoding="utf-8", errors="replace") as file:
-                if "lat" in file.readline().lower():
+            with suppress(SceneError):
+                if "lat" in next((line for _, line in table_lines(read_text(path))), "").lower():
                     return path
     return None
 

@@ -1,7 +1,4 @@
-"""Small files beside the images, as people and their programs write them: JSON, tables, lists of names.
-
-Text is UTF-8 with or without a byte order mark, UTF-16 with one, or else Windows' own encoding (Excel writes all four).
-"""
+"""Small files beside the images, as people and programs write them (``contracts.text_in``): JSON, tables, lists of names."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from heatsplat.contracts import SceneError, number_in
+from heatsplat.contracts import SceneError, number_in, table_lines, text_in
 
 
 def _named(word: str, letter: str) -> re.Pattern[str]:
@@ -55,13 +52,10 @@ def read_text(path: Path) -> str:
         data = path.read_bytes()
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error.strerror}") from error
-    marked = data[:2] in (b"\xff\xfe", b"\xfe\xff")
-    for encoding in ["utf-16"] if marked else ["utf-8-sig", "cp1252"]:
-        try:
-            return data.decode(encoding)
-        except UnicodeDecodeError:
-            continue
-    raise SceneError(f"{path} is no text file; save it as UTF-8")
+    try:
+        return text_in(data)
+    except ValueError as error:
+        raise SceneError(f"{path} is no text file; save it as UTF-8") from error
 
 
 def read_json(path: Path) -> Any:
@@ -146,11 +140,7 @@ def read_table(path: Path, names_columns: Callable[[list[str]], bool] | None = N
     Raises:
         SceneError: it cannot be read, or a row has fewer or more cells than there are columns; the message names the line.
     """
-    lines = [
-        (number, line)
-        for number, line in enumerate(read_text(path).splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#") and not re.fullmatch(r"\s*sep=.\s*", line)
-    ]
+    lines = table_lines(read_text(path))
     if not lines:
         raise SceneError(f"{path} is empty; a line of column names and rows below it are needed")
 

@@ -33,6 +33,8 @@ from heatsplat.errors import (  # noqa: F401
     is_number,
     number_in,
     rounded,
+    table_lines,
+    text_in,
 )
 
 SHARE_OF_RANGE = "share of the image's range"  # unit of a course in image units

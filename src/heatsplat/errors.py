@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Any
@@ -59,6 +60,28 @@ def number_in(text: str) -> float:
     if "_" in text:
         raise ValueError(f"could not convert string to float: {text!r}")
     return float(text)
+
+
+def text_in(data: bytes) -> str:
+    """Text as people and their programs save it: UTF-8 with or without a byte order mark, UTF-16 with one, or else Windows' own
+    encoding (Excel writes all four). Raises ValueError where it is none of them."""
+    marked = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+    for encoding in ["utf-16"] if marked else ["utf-8-sig", "cp1252"]:
+        try:
+            return data.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+    raise ValueError("it is no text; save it as UTF-8")
+
+
+def table_lines(text: str, comments: bool = True) -> list[tuple[int, str]]:
+    """Number, from 1 on, and text of the lines of a table: without empty ones, Excel's "sep=;", and with ``comments`` those that
+    begin with #."""
+    return [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not (comments and line.lstrip().startswith("#")) and not re.fullmatch(r"\s*sep=.\s*", line)
+    ]
 
 
 def counted(number: int, what: str) -> str:

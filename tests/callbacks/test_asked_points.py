@@ -95,6 +95,21 @@ def test_names_of_digits_stay_as_they_are(tmp_path):
     assert [one.name for one in asked_points(tmp_path / "points.csv", wall())] == ["7", "2.5", "point 3"]
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "cp1252", "utf-8-sig", "utf-8"])
+def test_tables_in_any_encoding_of_excel_are_read(tmp_path, encoding):
+    text = "sep=;\r\nname;x;y;z\r\n\r\nTür Süd;1,5;0;4\r\n#2;1;0;4\r\n"
+    (tmp_path / "points.csv").write_bytes(text.encode(encoding))
+    found = asked_points(tmp_path / "points.csv", wall())
+    assert [(one.name, one.point[0].item()) for one in found] == [("Tür Süd", 1.5), ("#2", 1.0)]
+
+
+def test_what_is_no_text_is_told_with_a_remedy(tmp_path):
+    for data in (b"PK\x03\x04\x81\x8d\xff", b"\xff\xfea"):
+        (tmp_path / "points.csv").write_bytes(data)
+        with pytest.raises(SceneError, match="points=.*points.csv cannot be read: it is no text; save it as UTF-8"):
+            asked_points(tmp_path / "points.csv", wall())
+
+
 @pytest.mark.parametrize("apart", [";", "\t"])
 def test_tables_of_other_programs_are_read(tmp_path, apart):
     lines = ["name;x;y;z", "stove;0,5;-1,25;4", "", "oven ;1;2;3"]

@@ -503,3 +503,13 @@ def test_real_points_project_onto_the_images():
     size = torch.tensor([[640.0], [512.0]])
     inside = ((pix > 0) & (pix < size)).all(0)
     assert (cam[2] > 0).all() and inside.float().mean() > 0.1
+
+
+def test_a_table_of_places_is_found_however_excel_saved_it(tmp_path):
+    write_colmap(tmp_path, names(9))
+    table = tmp_path / "meta.csv"
+    for encoding in ("utf-8-sig", "utf-16", "cp1252"):
+        table.write_bytes("sep=;\r\nfile;Lat;Höhe\r\na.png;51,0;1\r\n".encode(encoding))
+        assert loaded(tmp_path).positions == table
+    table.write_bytes(b"\x81\x8d")
+    assert loaded(tmp_path).positions is None

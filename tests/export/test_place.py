@@ -81,7 +81,12 @@ def test_tables_as_programs_write_them_and_images_of_one_name(cooling, tmp_path)
     text = path.read_text().replace(",", ";").replace(".", ",").replace(",png", ".png")
     path.write_bytes(b"\xef\xbb\xbf" + text.encode())
     assert torch.allclose(place_of(twice, path)(spot), expected, atol=1e-3)
-    path.write_text(path.read_text(encoding="utf-8-sig").replace("a/", "").replace("b/", ""))
+    path.write_bytes(("sep=;\r\n# by hand\r\n" + text).encode("utf-16"))
+    assert torch.allclose(place_of(twice, path)(spot), expected, atol=1e-3)
+    path.write_bytes(b"PK\x81")
+    with pytest.raises(SceneError, match="gps.csv cannot be read: it is no text; save it as UTF-8"):
+        place_of(twice, path)
+    path.write_text(text.replace("a/", "").replace("b/", ""))
     with pytest.raises(SceneError, match="has positions of [01] of the images"):
         place_of(twice, path)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, number_in
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, number_in, table_lines, text_in
 from heatsplat.geometry.projection import to_world
 
 OPTION = "callbacks.probes.points"
@@ -96,11 +96,12 @@ def asked_points(path: Path | str, scene: SceneData) -> list[AskedPoint]:
 def _rows(path: Path | str) -> list[dict[str, str]]:
     """The rows of a table by column, as text. Raises SceneError where it cannot be read."""
     try:
-        lines = Path(path).expanduser().read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, ValueError) as error:
+        text = text_in(Path(path).expanduser().read_bytes())
+        lines = [line for _, line in table_lines(text, comments=False)]  # a point may be called #1
+        apart = max(",;\t", key=(lines or [""])[0].count)
+        head, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=apart)] or [[]]
+    except (OSError, ValueError, csv.Error) as error:
         raise SceneError(f"{OPTION}={path} cannot be read: {error}") from error
-    apart = max(",;\t", key=(lines or [""])[0].count)
-    head, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=apart) if row] or [[]]
     if wrong := next((number for number, row in enumerate(rows, 1) if len(row) != len(head)), None):
         raise SceneError(f"{OPTION}={path}, row {wrong}: {len(rows[wrong - 1])} cells for {len(head)} columns")
     return [dict(zip(head, row, strict=True)) for row in rows]

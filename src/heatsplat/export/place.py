@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, number_in
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, number_in, table_lines, text_in
 from heatsplat.export.formats.base import optional
 from heatsplat.export.moment import Moment
 from heatsplat.geometry.alignment import Similarity, similarity_between
@@ -309,11 +309,9 @@ def _positions(path: Path, flat: bool = False) -> dict[str, tuple[float, float, 
 
 def _rows(path: Path) -> list[dict[str, str | None]]:
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            head = file.readline()
-            file.seek(0)
-            return list(csv.DictReader(file, delimiter=max(",;\t", key=head.count)))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        lines = [line for _, line in table_lines(text_in(path.read_bytes()))]
+        return list(csv.DictReader(lines, delimiter=max(",;\t", key=(lines or [""])[0].count)))
+    except (OSError, ValueError, csv.Error) as error:
         raise SceneError(f"{path} cannot be read: {error}") from error
 
 
