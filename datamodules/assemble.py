@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -195,9 +196,12 @@ def _split(
     rule, names = options.split, [f.name for f in frames]
     train, test = rule(names, list(range(len(frames))), [f.subset for f in frames])
     left_out = len(frames) - len(set(train) | set(test))
-    every_one, train, test = len(train), sorted(train)[:: options.every], sorted(test)
+    train, test = sorted(train), sorted(test)
     if options.every > 1:
-        notes["every"] = f"{len(train)} of {every_one}, by data.every={options.every}"
+        every_one, cameras = len(train), _by_camera([frames[i] for i in train])
+        train = sorted(train[i] for own in cameras for i in own[:: options.every])
+        each = f" of each of {len(cameras)} cameras" if len(cameras) > 1 else ""
+        notes["every"] = f"{len(train)} of {every_one}, by data.every={options.every}{each}"
         log.info("images for training: %s", notes["every"])
         if rule.rule == ALL:
             test = sorted(train[i] for i in every_nth([names[i] for i in train])[1])
@@ -220,6 +224,20 @@ def _split(
     if left_out:
         notes["split_left_out"] = f"{counted(left_out, 'frame')} in neither list, not used"
     return train, test, val
+
+
+def _by_camera(frames: Sequence[RawFrame]) -> list[list[int]]:
+    """Positions of the frames of each camera, in order: cameras differ by the folder of their images and by their lens, or by
+    folder and size of image where many a frame has a lens of its own, as reconstructions may fit them."""
+    folders = [PurePosixPath(frame.name).parent for frame in frames]
+    lenses = [frame.lens for frame in frames]
+    for kinds in (lenses, [(lens.width, lens.height) for lens in lenses]):
+        cameras: dict[Any, list[int]] = {}
+        for i, kind in enumerate(zip(folders, kinds, strict=True)):
+            cameras.setdefault(kind, []).append(i)
+        if 2 * len(cameras) <= len(frames):
+            return list(cameras.values())
+    return [list(range(len(frames)))]
 
 
 def _with_finite_points(raw: RawScene, notes: dict[str, Any]) -> RawScene:

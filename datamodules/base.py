@@ -45,7 +45,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         split_fraction: share of the frames that ``block`` holds out.
         split_position: where its stretch lies in time, 0 (start) to 1 (end).
         split_file: file of test names for ``list``, relative to the scene or the working directory.
-        every: of the training frames every so many-th is used (``SceneOptions``).
+        every: of the training frames of each camera every so many-th is used (``SceneOptions``).
         seed: of the order of views, and of random points where a scene has none.
         thermal_channels: 1, or 3 for pseudo-colour without temperatures.
         masks: folder in the scene with a mask <image name>.png per image (COLMAP's rule), which need not be there; None for none.

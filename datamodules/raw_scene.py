@@ -116,8 +116,8 @@ class SceneOptions:
         thermal_channels: 1, or 3 to keep pseudo-colour (which has no temperature: the range is dropped).
         alpha_mask: True to leave out pixels whose alpha is below one half; otherwise alpha is ignored.
         multiple: of which sides of images are that shrink, as close to W / d and H / d as that allows; 1 for any.
-        every: of the training frames every so many-th is used, in the order of their times (of names without), the first one
-            included; test frames are those of ``split``, or where it holds nothing out, some of the frames used.
+        every: of the training frames of each camera every so many-th is used, in the order of their times (of names without),
+            the first one included; test frames are those of ``split``, or where it holds nothing out, some of the frames used.
     """
 
     split: SplitRule

@@ -1,11 +1,14 @@
 import json
 
+import numpy as np
 import pytest
-from layouts import names, write_colmap
+from layouts import names, viewmats, write_colmap
 
 from heatsplat.contracts import SceneError
-from heatsplat.datamodules.assemble import FITTED
+from heatsplat.datamodules.assemble import FITTED, build_scene
 from heatsplat.datamodules.colmap import Colmap
+from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.raw_scene import RawFrame, RawScene, SceneOptions
 from heatsplat.datamodules.splits import SplitRule, block, by_folder, by_list, by_name, every_nth, quarter_centre
 
 
@@ -44,6 +47,34 @@ def test_every_so_many_th_training_frame_is_used_and_what_is_held_out_stays(tmp_
     assert all(shared[frame.name] == frame.frame_id for frame in few.frames)
     with pytest.raises(SceneError, match="data.every must be a whole number, 1 or more, got 0"):
         _ = Colmap(root=str(tmp_path), every=0).scene
+
+
+def by_two(frames, every):
+    data = RawScene("s", frames, np.random.default_rng(0).uniform(-1, 1, (30, 3)))
+    scene = build_scene(data, SceneOptions(SplitRule("json"), every=every))
+    return [frame.name for frame in scene.train.frames], scene.notes["every"]
+
+
+def turned(named, lenses):
+    """Frames in the order of their times, the last one for testing."""
+    return [
+        RawFrame(name, viewmats(3)[0], lens, lambda: np.zeros((32, 40), np.uint8), time_s=float(i),
+                 subset="train" if i < len(named) - 1 else "test")
+        for i, (name, lens) in enumerate(zip(named, lenses, strict=True))
+    ]  # fmt: skip
+
+
+def test_of_several_cameras_each_is_thinned_by_itself_in_the_order_of_time():
+    wide, far = (Lens(focal, focal, 20.0, 16.0, 40, 32) for focal in (30.0, 60.0))
+    files = [f"{i:03d}.png" for i in range(13)]
+    taken, note = by_two(turned(files, [wide, far] * 6 + [wide]), 2)  # they take turns
+    assert taken == [files[i] for i in (0, 1, 4, 5, 8, 9)] and note == "6 of 12, by data.every=2 of each of 2 cameras"
+    folders = [f"{'left' if i % 2 else 'right'}/{i // 2}.png" for i in range(13)]
+    assert by_two(turned(folders, [wide] * 13), 3)[0] == ["right/0.png", "left/0.png", "right/3.png", "left/3.png"]
+    # A lens for each image, as some reconstructions fit them, or a folder, makes no camera of each.
+    own = [Lens(30.0 + 0.01 * i, 30.0, 20.0, 16.0, 40, 32) for i in range(13)]
+    assert by_two(turned(files, own), 2) == (files[:12:2], "6 of 12, by data.every=2")
+    assert by_two(turned([f"{i:02d}/a.png" for i in range(13)], own), 4)[0] == ["00/a.png", "04/a.png", "08/a.png"]
 
 
 def test_where_nothing_is_held_out_test_frames_are_some_of_those_used(tmp_path):
