@@ -67,12 +67,13 @@ def read_metashape(path: Path) -> AlignedCameras:
     left_out: dict[str, str] = {}
     poses: dict[str, np.ndarray] = {}
     of: dict[str, ElementTree.Element] = {}
+    twice: dict[str, str] = {}
     for camera in chunk.iterfind("cameras//camera"):
         name, matrix = camera.get("label"), camera.find("transform")
         if not name:
             raise SceneError(f"{path}: camera {camera.get('id')} has no label, the name of its image; {EXPORT}")
         if name in of:
-            raise SceneError(
+            twice[name] = (
                 f"{path}: two cameras have the label {name!r}, and nothing tells whose camera is whose; rename one in Metashape, "
                 "or export each flight from a chunk of its own"
             )
@@ -84,6 +85,11 @@ def read_metashape(path: Path) -> AlignedCameras:
         else:
             where = f"{path}: transform of camera {name}"
             poses[name] = checked_pose(numbers_in(matrix.text, 16, where, EXPORT).reshape(4, 4), where)
+    for name in twice:
+        poses.pop(name, None)
+        left_out.pop(name, None)
+    if not poses and twice:
+        raise SceneError(next(iter(twice.values())))
     component_of = {name: of[name].get("component_id") for name in poses}
     used = {name: transforms.get(component) or of_chunk for name, component in component_of.items()}
     if None in used.values() and len(set(component_of.values())) > 1:  # components in coordinates of their own
@@ -103,7 +109,7 @@ def read_metashape(path: Path) -> AlignedCameras:
     if world.on_earth:
         origin, zero = from_geocentric(centers[:1])[0], centers[0]
         axes = east_north_up_axes(origin)
-    cameras, refused = {}, {}
+    cameras, refused = {}, twice
     for name, rotation, center in zip(poses, rotations, centers, strict=True):
         sensor = of[name].get("sensor_id")
         if sensor in lenses:

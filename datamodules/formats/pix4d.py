@@ -72,13 +72,16 @@ def read_pix4d(path: Path) -> AlignedCameras:
             raise SceneError(f"{path} ends within {name}, after {len(below)} of its {len(LINES)} lines; {EXPORT}")
         values = [numbers_in(text, count, f"{path}, line {i}: {what} of {name}", EXPORT)
                   for (i, text), (what, count) in zip(below, LINES, strict=True)]  # fmt: skip
-        if name in cameras or name in refused:
-            raise SceneError(
-                f"{path}, line {number}: {name} has two cameras; take one out, or rename the files of one flight"
-            )
         viewmat = world_to_camera(
             np.stack(values[6:]).T, values[5], f"{path}, line {number}: camera rotation R of {name}"
         )
+        at += 1 + len(LINES)
+        if name in cameras or name in refused:
+            refused[name] = (
+                f"{path}, line {number}: {name} has two cameras; take one out, or rename the files of one flight"
+            )
+            cameras.pop(name, None)
+            continue
         key = (*size, *np.concatenate(values[:5]))
         try:
             if key not in lenses:
@@ -87,7 +90,6 @@ def read_pix4d(path: Path) -> AlignedCameras:
             cameras[name] = viewmat, lenses[key]
         except SceneError as error:
             refused[name] = str(error)
-        at += 1 + len(LINES)
     return _placed(path, cameras, refused, notes)
 
 

@@ -138,6 +138,13 @@ def test_components_without_a_common_world_are_left_out_but_for_the_largest(tmp_
     assert list(found.cameras) == ["0", "1", "2", "3"] and "component 1, which nothing connects" in found.left_out["4"]
 
 
+def test_images_of_one_name_are_refused_for_themselves_alone(tmp_path):
+    poses = [np.linalg.inv(viewmat) for viewmat in VIEWMATS]
+    cameras = [camera(i, "ab"[i > 0], pose) for i, pose in enumerate(poses[:3])]
+    found = read_metashape(write_metashape(tmp_path / "a.xml", cameras, [calibration(METASHAPE)]))
+    assert list(found.cameras) == ["a"] and "two cameras have the label 'b'" in found.refused["b"]
+
+
 def test_a_lens_that_is_none_here_is_refused_for_its_own_images_alone(tmp_path):
     fish = calibration(METASHAPE, kind="equidistant_fisheye")
     skewed = calibration(METASHAPE | {"b2": -1.0})

@@ -93,7 +93,6 @@ def test_in_a_utm_zone_places_on_the_earth_are_seen_where_the_file_s_own_coordin
             "txt, line 13: radial distortion of DJI 0.JPG: could not convert string to float: '-0,21'; process",
         ),
         ("0.004 -0.002", "0.004", "txt, line 14: tangential distortion of DJI 0.JPG: 2 numbers are needed, it has 1"),
-        ("DJI 1.JPG", "DJI 0.JPG", "line 20: DJI 0.JPG has two cameras; take one out"),
         ("\nDJI", "\n", "flight_.*txt, line 9: camera rotation R of .* is no pose"),
     ],
 )
@@ -121,5 +120,10 @@ def test_files_that_end_early_or_have_no_image_are_refused(tmp_path):
     path.write_text("\n".join(lines[:8]))
     with pytest.raises(SceneError, match="has no line of an image .fileName imageWidth imageHeight.; process"):
         read_pix4d(path)
+    path = write_pix4d(tmp_path, VIEWMATS)
+    path.write_text(path.read_text().replace("DJI 1.JPG", "DJI 0.JPG"))  # of two flights
+    found = read_pix4d(path)
+    assert list(found.cameras) == [f"DJI {i}.JPG" for i in (2, 3, 4)]
+    assert "line 20: DJI 0.JPG has two cameras; take one out" in found.refused["DJI 0.JPG"]
     assert "a skew that moves" in read_pix4d(write_pix4d(tmp_path, VIEWMATS, skew=3.0)).refused["DJI 0.JPG"]
     assert "impossible" in read_pix4d(write_pix4d(tmp_path, VIEWMATS, cx=9e9)).refused["DJI 0.JPG"]
