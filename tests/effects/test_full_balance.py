@@ -9,7 +9,7 @@ import torch
 from scipy.integrate import solve_ivp
 from weathered import HOUR_S, make_weather
 
-from heatsplat.effects.full_balance import MODEL_K, FullBalance
+from heatsplat.effects.full_balance import MODEL_K, WAYS, FullBalance
 from heatsplat.effects.joint.held_out import WORST, compared
 from heatsplat.kernels.heat_balance import COVERS_MM
 from heatsplat.physics.sky import sky_temperature_k
@@ -204,3 +204,27 @@ def test_a_steady_wind_gains_nothing():
 def test_errors_of_the_balance_itself_are_expected():
     whole = balance()
     torch.testing.assert_close(whole.squares, (whole.left_out**2 / (NOISE_K**2 + MODEL_K**2)).clamp(max=WORST))
+
+
+def test_ways_are_those_in_which_likely_changes_move_a_balance():
+    one = balance()
+    ways, (numbers, _) = one.ways(FRAMES), one._likeliest
+    assert ways.shape[:2] == one.values.shape and 3 <= ways.shape[2] <= 1 + WAYS
+    found = one._temperatures(numbers)[0]
+    centred = found - found.mean(1, keepdim=True)
+    torch.testing.assert_close(ways[..., 0], centred)
+    step = (
+        0.01 * one._spread * torch.randn(numbers.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    )
+    moved = one._temperatures(numbers + step)[0] - found
+    moved = moved - moved.mean(1, keepdim=True)
+    left = moved[..., None] - ways[..., 1:] @ torch.linalg.lstsq(ways[..., 1:], moved[..., None]).solution
+    assert left.norm() < 0.05 * moved.norm()
+
+
+def test_fewer_ways_than_a_balance_has_are_none():
+    assert balance().ways(1) is None
+
+
+def test_the_likelier_of_two_skies_is_the_one_that_there_was():
+    assert balance().unlikely < balance(sky(0.0)).unlikely

@@ -34,6 +34,9 @@ EXPECTED = {
 FIRST_S = (1200.0, 7200.0)  # time constants from which fits start
 STEPS, STEPS_ON = 12, 6  # of a fit, and of one that goes on from a fit to more observations
 MODEL_K = 0.1  # by which such bodies err themselves
+# Usual errors by which likely changes of a balance move temperatures: from SMALL on all points together see it, though no single
+# one does; from LARGE on a balance is not known without. No more than WAYS of such changes are asked for.
+SMALL, LARGE, WAYS = 0.05, 1.0, 6
 ROBUST = 3.0  # expected errors from which an observation counts for less
 MEMORY_S = 10.0 * DAY_S  # of the record before the first frame, after which starts no longer matter
 
@@ -89,19 +92,61 @@ class FullBalance:
     @cached_property
     def left_out(self) -> Tensor:
         """What balances err by at observations that they were not fitted to, [P, F] in kelvin."""
-        starts = [self._expected.clone() for _ in FIRST_S]
-        for numbers, time_s in zip(starts, FIRST_S, strict=True):
-            numbers[:, self._names.index("log_rate")] = -math.log(time_s)
-        whole = self._fitted(self.weights > 0, starts, STEPS)[0]
+        whole = self._likeliest[0]
         fold, left = fold_of(*self.values.shape), torch.zeros_like(self.values)
         for k in range(FOLDS):
             found = self._fitted((self.weights > 0) & (fold != k), [whole], STEPS_ON)[1]
             left = torch.where(fold == k, self._above - found, left)
         return left
 
+    @cached_property
+    def unlikely(self) -> float:
+        """Squares of the errors at all observations and of the numbers that fit them, of likely ones the least."""
+        numbers, found = self._likeliest
+        return float(self._unlikely(self.weights > 0, found, numbers).sum())
+
+    def ways(self, most: int) -> Tensor | None:
+        """In which ways the temperature of each point may go, [P, F, 1 + k] in kelvin about means over its observations; None
+        where it may go in more.
+
+        The first is that of its balance; the others are the directions in which likely changes of its numbers move that most: as
+        many as move it by more than SMALL usual errors, and no more than ``most``.
+        """
+        numbers, _ = self._likeliest
+        found, slopes = self._temperatures(numbers)
+        used = (self.weights > 0).double()[..., None]
+        ways = torch.cat([found[..., None], slopes * self._spread], 2)
+        ways = ways - (ways * used).sum(1, keepdim=True) / used.sum(1, keepdim=True).clamp_min(1.0)
+        _, sizes, directions = torch.linalg.svd(ways[..., 1:] * used, full_matrices=False)
+        sizes = sizes.median(0).values / self.errors[self.weights > 0].median()
+        if most < min(int((sizes > LARGE).sum()), WAYS):
+            return None
+        count = min(most, WAYS, int((sizes > SMALL).sum()))
+        return torch.cat([ways[..., :1], ways[..., 1:] @ directions[:, :count].mT], 2)
+
+    @cached_property
+    def _likeliest(self) -> tuple[Tensor, Tensor]:
+        """Likeliest numbers [P, Q] by all observations, and temperatures [P, F] of such bodies above the reference."""
+        starts = [self._expected.clone() for _ in FIRST_S]
+        for numbers, time_s in zip(starts, FIRST_S, strict=True):
+            numbers[:, self._names.index("log_rate")] = -math.log(time_s)
+        return self._fitted(self.weights > 0, starts, STEPS)
+
     @property
     def _variance(self) -> Tensor:
         return self.errors**2 + MODEL_K**2
+
+    @property
+    def _spread(self) -> Tensor:
+        """Standard deviations [Q] of the numbers about what is expected of them."""
+        return self.values.new_tensor([EXPECTED[name][1] for name in self._names])
+
+    def _unlikely(self, used: Tensor, found: Tensor, numbers: Tensor) -> Tensor:
+        """Squares of the errors of temperatures at ``used`` [P, F], far ones no more than linear (Huber), with those of the
+        numbers, [P]."""
+        missed = (self._above - found).abs() / self._variance.sqrt()
+        squares = torch.where(missed < ROBUST, missed**2, 2.0 * ROBUST * missed - ROBUST**2)
+        return (squares * used).sum(1) + (((numbers - self._expected) / self._spread) ** 2).sum(1)
 
     @cached_property
     def _climate(self) -> Climate:
@@ -173,19 +218,11 @@ class FullBalance:
         Args:
             used: [P, F] observations that count.
         """
-        spread = self.values.new_tensor([EXPECTED[name][1] for name in self._names])
-
-        def unlikely(found: Tensor, numbers: Tensor) -> Tensor:
-            """Squares of the errors, far ones no more than linear (Huber), with those of the numbers, [P]."""
-            missed = (self._above - found).abs() / self._variance.sqrt()
-            squares = torch.where(missed < ROBUST, missed**2, 2.0 * ROBUST * missed - ROBUST**2)
-            return (squares * used).sum(1) + (((numbers - self._expected) / spread) ** 2).sum(1)
-
-        best = None
+        spread, best = self._spread, None
         for numbers in starts:
             damping = torch.full_like(numbers[:, 0], 0.1)
             found, slopes = self._temperatures(numbers)
-            cost = unlikely(found, numbers)
+            cost = self._unlikely(used, found, numbers)
             for _ in range(steps):
                 left = self._above - found
                 counts = used / self._variance * (ROBUST * self._variance.sqrt() / left.abs()).clamp(max=1.0)
@@ -194,7 +231,7 @@ class FullBalance:
                 held = inner + torch.diag_embed(damping[:, None] * inner.diagonal(dim1=1, dim2=2))
                 moved = numbers + torch.linalg.solve(held, pull).clamp(-2.0 * spread, 2.0 * spread)
                 there, steeper = self._temperatures(moved)
-                costs = unlikely(there, moved)
+                costs = self._unlikely(used, there, moved)
                 better = costs < cost
                 numbers, found = (torch.where(better[:, None], *pair) for pair in ((moved, numbers), (there, found)))
                 slopes, cost = torch.where(better[:, None, None], steeper, slopes), torch.where(better, costs, cost)

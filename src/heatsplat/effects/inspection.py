@@ -8,6 +8,7 @@ from functools import cached_property
 from heatsplat.contracts import SceneData
 from heatsplat.effects import heat_source, weather_record
 from heatsplat.effects.base import Effect
+from heatsplat.effects.beside_balances import beside_balances
 from heatsplat.effects.image_motion import Delays, delays
 from heatsplat.effects.joint.certainty import Certainty
 from heatsplat.effects.joint.data import Data
@@ -48,7 +49,16 @@ class Inspection:
 
     @cached_property
     def joint(self) -> tuple[Fit, Model] | None:
-        """The joint fit and the model that it selects; None where there are no tracks."""
+        """The joint fit and the model that it selects, beside full balances of heat where points follow these; None where there
+        are no tracks."""
+        by_record, weathered = self._by_record, self._weathered_by_record
+        if weathered is None:
+            return by_record
+        return beside_balances(by_record[0], weathered.likeliest, self.scene.thermal_range.span_k) or by_record
+
+    @cached_property
+    def _by_record(self) -> tuple[Fit, Model] | None:
+        """The joint fit, to which a weather record says roughly how surfaces change, and the model that it selects."""
         obs = self.obs
         if obs.tracks is None:
             return None
@@ -63,6 +73,8 @@ class Inspection:
         """What can be told from the joint fit; None where there is none."""
         if self.joint is None:
             return None
+        if self.joint is self._by_record and self._weathered_by_record is not None:
+            return self._certainty_by_record
         return Certainty(*self.joint, {} if self.beside_source is None else self.beside_source.told)
 
     @cached_property
@@ -90,12 +102,31 @@ class Inspection:
     @cached_property
     def weathered(self) -> Weathered | None:
         """The tracks, without what the camera adds, under the weather record; None without either, or air temperature."""
-        weather, bounds = self.scene.weather, self.scene.thermal_range
-        if self.joint is None or weather is None or weather.air_c is None or bounds is None or self.obs.times_s is None:
+        if self.joint is self._by_record:
+            return self._weathered_by_record
+        return self._weathered(*self.joint, self.certainty)
+
+    @cached_property
+    def _weathered_by_record(self) -> Weathered | None:
+        """The same, by what a record says roughly."""
+        weather = self.scene.weather
+        known = weather is not None and weather.air_c is not None and self.scene.thermal_range is not None
+        if not known or self.obs.times_s is None or self._by_record is None:
             return None
-        fit, model = self.joint
-        certain = [added for name, added in fit.contributions(model).items() if name not in self.certainty.doubts]
-        values = fit.data.tracks.values - sum(certain)
+        return self._weathered(*self._by_record, self._certainty_by_record)
+
+    @cached_property
+    def _certainty_by_record(self) -> Certainty:
+        return Certainty(*self._by_record)
+
+    def _weathered(self, fit: Fit, model: Model, certainty: Certainty) -> Weathered:
+        """The tracks without what the camera adds by a joint fit, under the weather record."""
+        weather, bounds = self.scene.weather, self.scene.thermal_range
+        certain = {name: added for name, added in fit.contributions(model).items() if name not in certainty.doubts}
+        added = sum(certain.values())
+        if "fixed_pattern" in certain:
+            added = added - added[fit.weights > 0].mean()  # nobody knows the level of a pattern
+        values = fit.data.tracks.values - added
         return Weathered(
             weather,
             self.obs.times_s,

@@ -231,10 +231,12 @@ class Weathered:
     @cached_property
     def rain(self) -> HeldOut | None:
         """What the record's rain gains; None where it tells of none, or not how moist the air is."""
-        weather = self.weather
-        if weather.rain_mm_h is None or weather.humidity_percent is None or not bool((weather.rain_mm_h > 0).any()):
-            return None
-        return self._over(replace(self.full, film_mm=FILM_MM), self.full)
+        return self._over(replace(self.full, film_mm=FILM_MM), self.full) if self._rains else None
+
+    @property
+    def _rains(self) -> bool:
+        rain, humid = self.weather.rain_mm_h, self.weather.humidity_percent is not None
+        return humid and rain is not None and bool((rain > 0).any())
 
     @cached_property
     def clouds(self) -> HeldOut | None:
@@ -257,6 +259,22 @@ class Weathered:
         some = slice(None, None, max(1, math.ceil(len(self.values) / FULL_POINTS)))
         seen = [None if one is None else one[some] for one in (self.values, self.errors, self.weights, self.normals)]
         return FullBalance(self.weather, self._sky_k, self.times_s, *seen)
+
+    @cached_property
+    def likeliest(self) -> FullBalance:
+        """Full balances of all points: under clouds, rain and with plants where those of ``full`` are likelier so."""
+        some = self.full
+        for one in self._may_be:
+            with_it = replace(some, **one)
+            some = with_it if with_it.unlikely < some.unlikely else some
+        return replace(some, values=self.values, errors=self.errors, weights=self.weights, normals=self.normals)
+
+    @property
+    def _may_be(self) -> list[dict[str, Any]]:
+        """What may hold of full balances beside what ``full`` takes."""
+        humid = self.weather.humidity_percent is not None
+        clouds = [] if self.weather.clouds is None else [{"sky_k": self._clouded_k}]
+        return clouds + ([{"film_mm": FILM_MM}] if self._rains else []) + ([{"transpires": True}] if humid else [])
 
     @cached_property
     def _wet(self) -> FullBalance:

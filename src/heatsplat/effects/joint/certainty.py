@@ -176,7 +176,9 @@ class Certainty:
     def may_warm(self) -> bool:
         """Whether points are lit or cool, or nobody can tell whether they do."""
         heat = [name for name, one in self.fit.data.effects.items() if one.term.in_time and name != ANY]
-        return any(name in self.model.names or name in self.doubts or self.few(name) for name in heat)
+        return self.fit.data.balances is not None or any(
+            name in self.model.names or name in self.doubts or self.few(name) for name in heat
+        )
 
     def few(self, name: str) -> str:
         """That the record has too few frames to tell an effect that was left out, and how many are needed; empty where it has
@@ -222,7 +224,7 @@ class Certainty:
 
     def beside_weather(self, model: Model) -> Model:
         """The model in a scene that changes in any way, where a weather record says roughly in which."""
-        return [model, *(self._changing(model) if self.fit.data.drivers is not None else ())][-1]
+        return [model, *(self._changing(model) if self.fit.data.rough else ())][-1]
 
     def _changing(self, model: Model) -> list[Model]:
         """The model in a scene that changes in any way, with one common course and with more; none where points are seen in too
@@ -245,7 +247,7 @@ class Certainty:
         """Whether an effect is clear however the scene may change, where its changes are not known well: a camera's change of
         single images explains them as well as any course over time of which each point has its own measure would, and other
         effects gain beside that."""
-        unfollowed, rough = self._may_be_change(name), self.fit.data.drivers is not None
+        unfollowed, rough = self._may_be_change(name), self.fit.data.rough
         if ANY in less.names or not rough and not unfollowed:
             return True
         changing = self._changing(less)

@@ -30,6 +30,9 @@ class Data:
         noise: of a pixel, in image units.
         normals: [P, 3] of the surface at the points, or None.
         drivers: [F, k] how surfaces answer a weather record, which then stands for relaxation, or None.
+        balances: [P, F, k] in which ways each point's own balance of heat goes under that record, in the place of ``drivers``
+            where points follow such balances to within the errors expected of them, or None.
+        balances_err: by how much these may err together in an image.
     """
 
     effects: Mapping[str, Effect]
@@ -39,6 +42,13 @@ class Data:
     noise: float
     normals: Tensor | None = None
     drivers: Tensor | None = None
+    balances: Tensor | None = None
+    balances_err: float = 0.0
+
+    @property
+    def rough(self) -> bool:
+        """Whether a weather record says roughly how surfaces change, no better than any other answer to it would."""
+        return self.drivers is not None and self.balances is None
 
     @property
     def frames(self) -> int:

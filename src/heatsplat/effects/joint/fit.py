@@ -183,6 +183,7 @@ class Fit:
         """The points' own basis [P, F, k] before the path: a level and the bases of a model's effects."""
         points, frames = self.data.tracks.values.shape
         parts = [torch.ones(frames, 1, dtype=self.weights.dtype)]
+        parts += [] if self.data.balances is None else [self.data.balances]
         parts += [self.basis(name, model.kind(name)) for name in self.terms(model, Own)]
         if any(part.ndim == 3 for part in parts):
             return torch.cat([part.expand(points, -1, -1) for part in parts], 2)

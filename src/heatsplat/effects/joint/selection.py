@@ -159,6 +159,6 @@ def worthwhile(fit: Fit, more: Model, less: Model, name: str) -> bool:
         if makes_do(fit, less, more.minus({other}), less.minus({other})):
             return False
     at_rest = fit.at_rest(less)
-    rough = fit.data.drivers is not None and ANY not in less.names
+    rough = fit.data.rough and ANY not in less.names
     share = BESIDE_WEATHER if rough else term.beside_changes
     return at_rest == less or size > share * fit.effect_size(less, at_rest)

@@ -39,7 +39,8 @@ def evidence(inspected: Inspection) -> Evidence:
         return Evidence(None, STILL)
     none = certainty.beside_weather(certainty.model.minus(PATTERNS))
     share, gain = vignetting.falloff(fit, none)
-    fades = share < vignetting.MIN_FALLOFF and gain > vignetting.EFFECT.threshold
+    fades = share < vignetting.MIN_FALLOFF
+    fades = fades and (gain > vignetting.EFFECT.threshold or vignetting.makes_do_alone(certainty, none))
     less = none.plus("vignetting") if fades else none
     more = less.plus("fixed_pattern")
     found = "places in the image differ" + (" beside the falloff" if fades else "") + " by"
@@ -60,7 +61,7 @@ def _much(certainty: Certainty, more: Model, less: Model) -> bool:
     What changes over time or from image to image stays: it may be something else, but something changes the images.
     """
     fit = certainty.fit
-    if fit.data.drivers is not None:
+    if fit.data.rough:
         return False
     terms = {name: fit.data.effects[name].term for name in less.names & certainty.doubts.keys()}
     doubted = [name for name, term in terms.items() if not (term.in_time or term.single_images)]

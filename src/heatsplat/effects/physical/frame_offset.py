@@ -50,8 +50,21 @@ def starts(data: Data) -> Sequence[Model]:
 
 
 def in_common(fit: Fit, more: Model, less: Model) -> bool:
-    """``common_to_all``; where nothing changes there is nothing to ask."""
-    return not fit.may_change(less) or common_to_all(fit, more, less)
+    """``common_to_all``, and no heat; where nothing changes there is nothing to ask."""
+    return not fit.may_change(less) or common_to_all(fit, more, less) and not as_balances_err(fit, more, less)
+
+
+def as_balances_err(fit: Fit, more: Model, less: Model) -> bool:
+    """Whether what single images have in common, beside what balances of heat of their points may make of it, is no more than
+    these err together."""
+    if fit.data.balances is None:
+        return False
+    shared = fit.contributions(more)
+    single = [name for name in shared.keys() - less.names if fit.data.effects[name].term.single_images]
+    added, basis, used = sum(shared[name] for name in single), fit.own_basis(more), (fit.weights > 0).double()
+    free = used.sum(1) - basis.shape[2]
+    beyond = ((added - own_part(basis, added, used)) ** 2 * used).sum(1) / free.clamp_min(1.0)
+    return bool((free > 0).any()) and float(beyond[free > 0].median().sqrt()) < fit.data.balances_err
 
 
 def common_to_all(fit: Fit, more: Model, less: Model) -> bool:

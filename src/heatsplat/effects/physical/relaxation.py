@@ -13,24 +13,29 @@ from heatsplat.effects.joint.courses import DECAYS, DECAYS_FEW, LONG
 from heatsplat.effects.joint.data import MIN_FREE, Data
 from heatsplat.effects.joint.evidence import gained
 from heatsplat.effects.joint.fit import Fit
+from heatsplat.effects.joint.held_out import HeldOut
 from heatsplat.effects.joint.model import Model
 from heatsplat.effects.joint.terms import OWN_HURDLE, Own, well_seen
-from heatsplat.effects.weathered import MIN_DB, SIGMAS
+from heatsplat.effects.weathered import MIN_DB, SIGMAS, weighed
 
 BESIDE_DRIFT = 0.25  # share of a common offset that other changes must exceed before a still camera
 
 
 def evidence(inspected: Inspection) -> Evidence:
     """Whether points tend to another temperature as time goes by; what follows sun, sky or wind does."""
+    weathered, joint = inspected.weathered, inspected.joint
+    if joint is not None and joint[0].data.balances is not None:
+        return weighed(weathered.follows, _over_levels(weathered.follows))
     found = gained(inspected, "relaxation", "points change over time by")
     on = found.told and found.statistic is not None and found.statistic > EFFECT.threshold
-    if on or inspected.weathered is None:
-        return found
-    gain = inspected.weathered.follows
-    if gain.exceeds(MIN_DB, SIGMAS):
-        said = f"balances of heat gain {gain.db:.2f} dB over levels where left out, {gain.sigmas:.1f} standard errors"
-        return Evidence(gain.sigmas, said, gain_db=gain.db)
+    if not on and weathered is not None and weathered.follows.exceeds(MIN_DB, SIGMAS):
+        gain = weathered.follows
+        return Evidence(gain.sigmas, _over_levels(gain), gain_db=gain.db)
     return found
+
+
+def _over_levels(gain: HeldOut) -> str:
+    return f"balances of heat gain {gain.db:.2f} dB over levels where left out, {gain.sigmas:.1f} standard errors"
 
 
 def rates(data: Data) -> tuple[float, ...]:

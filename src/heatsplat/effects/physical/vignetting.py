@@ -11,6 +11,7 @@ from torch import Tensor
 from heatsplat.effects.base import Effect, Evidence, Part
 from heatsplat.effects.heat_source import PATTERNS
 from heatsplat.effects.inspection import Inspection
+from heatsplat.effects.joint.certainty import Certainty
 from heatsplat.effects.joint.columns import Columns
 from heatsplat.effects.joint.data import Data
 from heatsplat.effects.joint.evidence import beside
@@ -43,16 +44,18 @@ def evidence(inspected: Inspection) -> Evidence:
     why = (
         f"distance from the middle of the image changes values by {beside(size)} ({100 * share:+.0f} % in the corners)"
     )
-    if fit.data.drivers is not None and _heat_may_be_it(fit, radial, none, share, gain):
+    if fit.data.rough and _heat_may_be_it(fit, radial, none, share, gain):
         why = f"{why}: cannot be told, heat may pass for it or hide it; more frames would tell"
         return Evidence(gain, why, told=False)
     if share >= MIN_FALLOFF:
         return Evidence(0.0, f"{why}, which is no falloff")
+    alone = makes_do_alone(certainty, none)
+    gain = max(gain, fit.gain(radial, none)) if alone else gain
     if not worthwhile(fit, radial, none, "vignetting"):
         return Evidence(0.0, why)
     worth = certainty.worth("vignetting", radial, none)
     doubt = worth.doubt or certainty.doubts.get("vignetting", "")
-    if UNSURE[0] < gain < UNSURE[1]:
+    if UNSURE[0] < gain < UNSURE[1] and not alone:
         doubt = "a pattern of the camera may have as much of a falloff; more frames would tell"
     told = gain <= UNSURE[0] or not doubt
     return Evidence(gain, why if told else f"{why}: cannot be told, {doubt}", told=told, gain_db=worth.held_out.db)
@@ -66,6 +69,17 @@ def _heat_may_be_it(fit: Fit, radial: Model, none: Model, share: float, gain: fl
     wild = share > WILD or share < -WILD and gain < UNSURE[0]
     fades = share < MIN_FALLOFF and gain > UNSURE[0] and worthwhile(fit, radial, none, "vignetting")
     return wild or not fades and fit.effect_size(radial, none) >= EFFECT.term.smallest
+
+
+def makes_do_alone(certainty: Certainty, none: Model) -> bool:
+    """Whether a falloff foresees what was left out better than any pattern of the camera does.
+
+    Args:
+        none: the model without falloff and pattern.
+    """
+    radial, pattern = none.plus("vignetting"), none.plus("fixed_pattern")
+    chosen = "vignetting" in certainty.model.names and "fixed_pattern" not in certainty.model.names
+    return chosen and certainty.compared(radial, pattern).db > 0
 
 
 def columns(data: Data, image: Tensor, known: Mapping[str, Tensor]) -> Columns:
