@@ -104,6 +104,11 @@ class Reproduction:
         """Such as "ETGS, Tab. 1"."""
         return f"{TITLES[self.paper]}, " + ("running text" if self.table == "text" else f"Tab. {self.table}")
 
+    @property
+    def printed_metrics(self) -> list[str]:
+        """Metrics of which the table prints figures, in its order."""
+        return list(dict.fromkeys(figure.metric for figure in self.figures))
+
     def ours(self, metric: str) -> str | None:
         """Score or cost in metrics.json that a printed metric is compared with."""
         return self.metrics.get(metric, METRICS[metric].ours)
@@ -140,8 +145,7 @@ class Reproduction:
                 f"  Before them, {len(firsts)} runs: {', '.join(f'{row} on {where}' for row, where in firsts)}"
             )
         lines += [f"  {text}" for text in self.left_out()]
-        printed = {figure.metric for figure in self.figures}
-        if (self.runs or self.missing) and printed & {"lpips", "rgb_lpips"}:
+        if (self.runs or self.missing) and {"lpips", "rgb_lpips"} & set(self.printed_metrics):
             try:
                 find_backbone(str(lpips_net), lpips_weights)
             except LpipsUnavailable as error:
