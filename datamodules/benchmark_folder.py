@@ -65,19 +65,25 @@ def write_scenes(
         raise SceneError(f"study.scenes: there is no {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     for name in scenes or known:
         made_from = {"protocol": protocol["version"], **({"size": None} if name in (real or {}) else settings[name])}
-        meta = target / SCENES / name / META
-        if meta.exists():
-            before = json.loads(meta.read_text())
-            if changed := [key for key, value in made_from.items() if before.get(key) != value]:
-                raise SceneError(
-                    f"{meta.parent} was written with another {' and '.join(changed)}: delete it, or give study.target another "
-                    "folder"
-                )
-            log.info("%s is there already", meta.parent)
+        folder = target / SCENES / name
+        if _is_there(folder, made_from):
+            log.info("%s is there already", folder)
             continue
-        log.info("writing %s", meta.parent)
+        log.info("writing %s", folder)
         prefix = "near_" if name in (real or {}) else ""
-        write_scene(known[name]().scene, target / SCENES / name, target / TRUTH / name, made_from, prefix)
+        write_scene(known[name]().scene, folder, target / TRUTH / name, made_from, prefix)
+
+
+def _is_there(folder: Path, made_from: Mapping[str, Any]) -> bool:
+    """Whether a folder holds a scene. Raises SceneError where that was made from something else."""
+    if not (folder / META).exists():
+        return False
+    before = json.loads((folder / META).read_text())
+    if changed := [key for key, value in made_from.items() if before.get(key) != value]:
+        raise SceneError(
+            f"{folder} was written with another {' and '.join(changed)}: delete it, or give study.target another folder"
+        )
+    return True
 
 
 def write_scene(scene: SceneData, folder: Path, truth: Path, also: Mapping[str, Any], prefix: str = "") -> None:
@@ -142,12 +148,12 @@ def _write_views(scene: SceneData, subset: str, views: ViewSet, folder: Path, tr
         entry |= {"thermal_file_path": f"thermal/{name}.tiff", "time_s": view.time_s}
         frames.append(entry | camera_entry(view.camera))
         if subset == "train":
-            _tiff(folder / "thermal" / f"{name}.tiff", _celsius(scene, view, "thermal"))
+            _image(folder / "thermal" / f"{name}.tiff", _celsius(scene, view, "thermal"))
         else:
-            _tiff(truth / f"{name}.tiff", _celsius(scene, view, "clean"))
+            _image(truth / f"{name}.tiff", _celsius(scene, view, "clean"))
         if view.rgb is not None:
             place = folder if subset == "train" else truth
-            _png(place / "images" / f"{name}.png", (view.rgb.numpy() * 255.0).round().astype(np.uint8))
+            _image(place / "images" / f"{name}.png", (view.rgb.numpy() * 255.0).round().astype(np.uint8))
     _json(folder / FILES[subset], {"camera_model": "PINHOLE", "ply_file_path": "points3D.ply", "frames": frames})
 
 
@@ -172,14 +178,9 @@ def _celsius(scene: SceneData, view: View, which: str) -> np.ndarray:
     return celsius if view.mask is None else np.where(view.mask.numpy(), celsius, np.float32(np.nan))
 
 
-def _tiff(path: Path, celsius: np.ndarray) -> None:
+def _image(path: Path, pixels: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(celsius).save(path, format="TIFF")
-
-
-def _png(path: Path, pixels: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path, format="PNG")
+    Image.fromarray(pixels).save(path)
 
 
 def _json(path: Path, values: Mapping[str, Any]) -> None:

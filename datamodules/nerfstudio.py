@@ -149,34 +149,19 @@ class Nerfstudio(SceneDataModule):
         self, folder: Path, listed: Mapping[Transforms, str | None], bounds: ThermalRange | None
     ) -> tuple[list[RawFrame], dict[str, Any]]:
         index, masks = ImageIndex(folder), self.mask_index(folder)
-        apart = any((folder / "thermal").glob("transforms*.json"))  # thermal images have cameras of their own
-        if apart and (first := next(iter(listed))).path.parent == folder:
-            log.warning(
-                "scene %s: the cameras are those of %s; for those in thermal/ give data.root=%s data.scene=null",
-                *(folder.name, first.path.name, folder / "thermal"),
-            )
-        entries = [
-            Entry(
-                transforms, subset, frame, *_files_of(frame, transforms.path.parent.relative_to(folder), index, apart)
-            )
-            for transforms, subset in listed.items()
-            for frame in transforms.frames
-        ]
-        entries, photos, assumed = self._told_apart(folder, entries, bounds)
+        entries, photos, assumed = self._told_apart(folder, _entries(folder, listed, index), bounds)
         notes: dict[str, Any] = {"registered": len(entries), **assumed}
         _check_thermal(entries)
         subsets = _listed_subsets([*listed], entries)
         mains = [entry.visible if photos else entry.thermal for entry in entries]
-        plain_names = [PurePosixPath(main).name for main in mains if main is not None]
-        with_folders = len(listed) > 1 or len(set(plain_names)) < len(plain_names)
+        names = _names(mains, several=len(listed) > 1)
         frames, missing, written = [], [], {}
-        for entry, main, in_list in zip(entries, mains, subsets, strict=True):
+        for entry, main, name, in_list in zip(entries, mains, names, subsets, strict=True):
             if main is None:
                 missing.append(str(entry.frame["file_path"]))
                 continue
             rgb_file = entry.visible if self.rgb or photos else None
             read = partial(read_thermal, folder / main)
-            name = main if with_folders else PurePosixPath(main).name
             frames.append(
                 RawFrame(
                     name=name,
@@ -312,6 +297,30 @@ def bounds_of(folder: Path) -> tuple[ThermalRange | None, dict[str, Any]]:
         return None, {"bounds_source": f"none: there is no {BOUNDS_FILE}"}
     bounds, swapped = read_bounds(path, swap=True)
     return bounds, {"bounds_source": path.name + (" (minimum and maximum were swapped)" if swapped else "")}
+
+
+def _entries(folder: Path, listed: Mapping[Transforms, str | None], index: ImageIndex) -> list[Entry]:
+    """The frames of the transforms files, each with its stored images."""
+    apart = any((folder / "thermal").glob("transforms*.json"))  # thermal images have cameras of their own
+    if apart and (first := next(iter(listed))).path.parent == folder:
+        log.warning(
+            "scene %s: the cameras are those of %s; for those in thermal/ give data.root=%s data.scene=null",
+            *(folder.name, first.path.name, folder / "thermal"),
+        )
+    entries = []
+    for transforms, subset in listed.items():
+        place = transforms.path.parent.relative_to(folder)
+        entries += [
+            Entry(transforms, subset, frame, *_files_of(frame, place, index, apart)) for frame in transforms.frames
+        ]
+    return entries
+
+
+def _names(mains: Sequence[str | None], several: bool) -> list[str | None]:
+    """Names of frames by their images' files, with folders where two have one name, or there are ``several`` transforms files."""
+    plain_names = [None if main is None else PurePosixPath(main).name for main in mains]
+    known = [name for name in plain_names if name is not None]
+    return list(mains) if several or len(set(known)) < len(known) else plain_names
 
 
 def _check_thermal(entries: Sequence[Entry]) -> None:

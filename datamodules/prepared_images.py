@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -225,56 +225,74 @@ def check_masks(prepared: Iterable[PreparedImage]) -> None:
 
 
 def image_notes(prepared: Mapping[int, PreparedImage], downscale: float) -> dict[str, Any]:
-    """What the images of a scene have in common and where they differ."""
-    found = [p.found for p in prepared.values()]
+    """What the images of a scene have in common and where they differ; what is doubtful about that is warned of."""
+    images = list(prepared.values())
+    found = [p.found for p in images]
 
     def tally(key: str) -> str:
-        counted = Counter(str(f[key]) for f in found)
-        return next(iter(counted)) if len(counted) == 1 else ", ".join(f"{k} ({n})" for k, n in counted.items())
+        counts = Counter(str(f[key]) for f in found)
+        return next(iter(counts)) if len(counts) == 1 else ", ".join(f"{k} ({n})" for k, n in counts.items())
 
-    grids = Counter(f"{p.lens.width}x{p.lens.height}" for p in prepared.values())
     notes: dict[str, Any] = {
         "image_size": tally("size"),
         "pixel_type": tally("type"),
         "channels": tally("channels"),
         "camera_model": tally("model"),
         "downscale": downscale,
-        "grid": ", ".join(grids),
+        "grid": ", ".join(dict.fromkeys(f"{p.lens.width}x{p.lens.height}" for p in images)),
     }
-    least = min((p.lens for p in prepared.values()), key=lambda lens: min(lens.width, lens.height))
-    if downscale > 1 and min(least.width, least.height) < SMALL_PX:
-        log.warning(
-            "data.downscale=%g leaves images of %dx%d pixels, of which nothing is seen and SSIM needs %d along each side",
-            downscale, least.width, least.height, SMALL_PX,
-        )  # fmt: skip
-    if rescaled := Counter((f["size"], f["camera"]) for f in found if f["size"] != f["camera"]):
-        pairs = ", ".join(
-            f"{counted(n, 'image')} of {size} with a camera of {of}" for (size, of), n in rescaled.most_common(3)
-        )
-        notes["intrinsics_rescaled"] = f"{pairs}: intrinsics follow the image"
-        if any(f["squeezed"] for f in found):
-            notes["intrinsics_rescaled"] += (
-                ", by another factor across than down; if images were cropped, give cameras of those"
-            )
-            log.warning("%s", notes["intrinsics_rescaled"])
-        else:
-            log.info("%s", notes["intrinsics_rescaled"])
+    _warn_of_small(images, downscale)
+    notes |= _rescaled_notes(found)
     if distorted := sum(f["distorted"] for f in found):
         notes["distortion"] = f"{counted(distorted, 'image')} undistorted onto a pinhole of the same focal length"
     if nan := sum(f["nan"] for f in found):
         notes["nan_pixels"] = f"{counted(nan, 'pixel')} masked: NaN, infinite or below absolute zero"
         log.warning("%s", notes["nan_pixels"])
-    if rgb := sum(f["rgb_resized"] for f in found):
-        notes["rgb_resized"] = f"{counted(rgb, 'visible image')} resized to the thermal grid"
-    if squeezed := sum(f["rgb_squeezed"] for f in found):
-        notes["rgb_resized"] += f", {squeezed} of which have another shape"
+    notes |= _visible_notes(found)
+    if resized_masks := sum(f["mask_resized"] for f in found):
+        notes["masks_resized"] = f"{counted(resized_masks, 'mask')} of another size, resized to the image's"
+    if masked := [p.mask for p in images if p.mask is not None]:
+        pixels = sum(p.lens.width * p.lens.height for p in images)
+        notes["masked_fraction"] = sum(int((~m).sum()) for m in masked) / pixels
+    return notes
+
+
+def _warn_of_small(images: Iterable[PreparedImage], downscale: float) -> None:
+    """Warns of images of which downscaling leaves next to nothing."""
+    least = min((p.lens for p in images), key=lambda lens: min(lens.width, lens.height))
+    if downscale > 1 and min(least.width, least.height) < SMALL_PX:
+        log.warning(
+            "data.downscale=%g leaves images of %dx%d pixels, of which nothing is seen and SSIM needs %d along each side",
+            downscale, least.width, least.height, SMALL_PX,
+        )  # fmt: skip
+
+
+def _rescaled_notes(found: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Which images have another size than their camera."""
+    rescaled = Counter((f["size"], f["camera"]) for f in found if f["size"] != f["camera"])
+    if not rescaled:
+        return {}
+    pairs = ", ".join(
+        f"{counted(n, 'image')} of {size} with a camera of {of}" for (size, of), n in rescaled.most_common(3)
+    )
+    note, level = f"{pairs}: intrinsics follow the image", logging.INFO
+    if any(f["squeezed"] for f in found):
+        note += ", by another factor across than down; if images were cropped, give cameras of those"
+        level = logging.WARNING
+    log.log(level, "%s", note)
+    return {"intrinsics_rescaled": note}
+
+
+def _visible_notes(found: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Which visible images have another size or shape than the thermal ones."""
+    resized_ones, squeezed = (sum(f[key] for f in found) for key in ("rgb_resized", "rgb_squeezed"))
+    if not resized_ones:
+        return {}
+    note = f"{counted(resized_ones, 'visible image')} resized to the thermal grid"
+    if squeezed:
+        note += f", {squeezed} of which have another shape"
         log.warning(
             "%s have another shape than the thermal ones and are squeezed onto them: crop or rectify them to what the thermal "
             "camera sees, or leave them out (data.rgb)", counted(squeezed, "visible image"),
         )  # fmt: skip
-    if resized_masks := sum(f["mask_resized"] for f in found):
-        notes["masks_resized"] = f"{counted(resized_masks, 'mask')} of another size, resized to the image's"
-    if masked := [p.mask for p in prepared.values() if p.mask is not None]:
-        share = sum(int((~m).sum()) for m in masked) / sum(p.lens.width * p.lens.height for p in prepared.values())
-        notes["masked_fraction"] = share
-    return notes
+    return {"rgb_resized": note}

@@ -90,14 +90,11 @@ class Synthetic(SceneDataModule):
             )
         number = number_of(scene, DRAWN)
         self.drawn = None if number is None else drawn(number)
-        outdoors = scene in YARDS or self.drawn is not None and isinstance(self.drawn.preset, OutdoorPreset)
         in_parts = split == "parts"
         # The subsets of the frames ("json") are the parts, too.
         own_split = "json" if in_parts else YARDS[scene][1].split if scene in YARDS else "every_8th"
         super().__init__(root=root, scene=scene, split=own_split if in_parts else split or own_split, **options)
-        if scene not in PRESETS and not outdoors and self.drawn is None and number_of(scene, ROOM) is None:
-            known = ", ".join((*PRESETS, *YARDS, *(f"{name}0, {name}1 and so on" for name in (ROOM, DRAWN))))
-            raise SceneError(f"data.scene={scene}: there is no such synthetic preset; choose one of {known}")
+        _check_name(scene)
         _check_times(scene, days, hours)
         if weather is not None:
             _check_weather(scene, weather, self.drawn is not None)
@@ -109,19 +106,22 @@ class Synthetic(SceneDataModule):
         self.noise_k = usual.noise_k if noise_k is None else noise_k
         self.bits = usual.bits if bits is None else bits
         self.pose_error_px = usual.pose_error_px if pose_error_px is None else pose_error_px
-        if not 0 <= self.noise_k < math.inf:
-            raise SceneError(f"data.noise_k={noise_k}: the noise is a standard deviation in kelvin, 0 or more")
-        if self.bits not in STORED:
-            raise SceneError(f"data.bits={bits}: images are stored in 8 or 16 bits")
-        if not 0 <= self.pose_error_px < math.inf:
-            raise SceneError(
-                f"data.pose_error_px={pose_error_px}: the error is a standard deviation in pixels, 0 or more"
-            )
+        self._check_camera()
         self.scene_seed = scene_seed
         self.only = only
         self.weather, self.days = weather, days
         self.hours = None if hours is None else (float(hours[0]), float(hours[1]))
         self.parts = rules(parts) if in_parts else None
+
+    def _check_camera(self) -> None:
+        if not 0 <= self.noise_k < math.inf:
+            raise SceneError(f"data.noise_k={self.noise_k}: the noise is a standard deviation in kelvin, 0 or more")
+        if self.bits not in STORED:
+            raise SceneError(f"data.bits={self.bits}: images are stored in 8 or 16 bits")
+        if not 0 <= self.pose_error_px < math.inf:
+            raise SceneError(
+                f"data.pose_error_px={self.pose_error_px}: the error is a standard deviation in pixels, 0 or more"
+            )
 
     def load(self) -> SceneData:
         """The recording as a scene; its truth and probes come from the solver."""
@@ -199,6 +199,12 @@ class Synthetic(SceneDataModule):
             return solved(known if self.hours is None else replace(known, hours=self.hours))
         preset = None if self.drawn is None else self.drawn.preset
         return OutdoorScene(preset) if isinstance(preset, OutdoorPreset) else None
+
+
+def _check_name(scene: str) -> None:
+    if scene not in PRESETS and scene not in YARDS and all(number_of(scene, name) is None for name in (ROOM, DRAWN)):
+        known = ", ".join((*PRESETS, *YARDS, *(f"{name}0, {name}1 and so on" for name in (ROOM, DRAWN))))
+        raise SceneError(f"data.scene={scene}: there is no such synthetic preset; choose one of {known}")
 
 
 def _check_times(scene: str, days: int | None, hours: Sequence[float] | None) -> None:

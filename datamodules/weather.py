@@ -83,31 +83,15 @@ def make_weather(
         _check_range(name, values, times_s, source)
     times_s, columns, notes = _in_order(np.asarray(times_s, dtype=np.float64), columns, notes)
     columns = {name: values for name, values in columns.items() if np.isfinite(values).sum() >= 2}
-    if "humidity_percent" in columns and 0 < (most := float(np.nanmax(columns["humidity_percent"]))) <= 1:
-        raise SceneError(
-            f"{source}: humidity_percent is {most:g} at the most, drier than any air. Shares are no per cent: name such a column "
-            "humidity_fraction, or multiply by 100"
-        )
-    for name in (RAIN, FALLEN):  # which many records leave out where none fell
-        if name in columns and (gaps := int(np.isnan(columns[name]).sum())):
-            columns[name] = np.nan_to_num(columns[name])
-            notes["dry"] = f"{gaps} samples without {name} are taken for dry"
+    _check_shares(columns, source)
+    _take_for_dry(columns, notes)
     if len(times_s) < 2 or not columns:
         raise SceneError(f"{source} holds no weather: two or more samples of at least one column are needed")
     times_s, columns = _common_span(times_s, columns, notes)
     columns = {name: _filled(name, times_s, values, max_gap_s, source, notes) for name, values in columns.items()}
     _complete(times_s, columns, source, notes)
-    missing = [name for name in WEATHER_COLUMNS if name not in columns]
-    if missing:
-        notes["missing"] = ", ".join(missing)
-
     absolute = bool(times_s[0] >= FIRST_EPOCH_S)
-    if absolute:
-        notes["utc_at_zero_s"] = 0.0
-        notes["from_utc"], notes["to_utc"] = (utc_text(t) for t in (times_s[0], times_s[-1]))
-    notes["span_h"] = round((times_s[-1] - times_s[0]) / 3600.0, 3)
-    notes["step_min"] = round(float(np.median(np.diff(times_s))) / 60.0, 3)
-    notes["ranges"] = {name: [round(float(v.min()), 2), round(float(v.max()), 2)] for name, v in columns.items()}
+    notes |= _notes_of(times_s, columns, absolute)
     sunlight: dict[str, np.ndarray] = {}
     if site is None or not absolute:
         what = "latitude and longitude are" if site is None else "the UTC of its times is"
@@ -115,8 +99,9 @@ def make_weather(
     else:
         times_s, columns, sunlight = _with_sun(times_s, columns, site, source, notes)
     tensors = {name: torch.from_numpy(np.ascontiguousarray(v)) for name, v in {**columns, **sunlight}.items()}
-    up = None if site is None else {"up": torch.from_numpy(site.axes()[2])}
-    return Weather(times_s=torch.from_numpy(times_s), notes=notes, **tensors, **(up or {}))
+    if site is not None:
+        tensors["up"] = torch.from_numpy(site.axes()[2])
+    return Weather(times_s=torch.from_numpy(times_s), notes=notes, **tensors)
 
 
 def with_weather(scene: SceneData, path: Path, zone: str | None = None, max_gap_s: float = MAX_GAP_S) -> SceneData:
@@ -187,6 +172,37 @@ def _check_range(name: str, values: np.ndarray, times_s: np.ndarray, source: str
             f"{source}: {name} is {values[first]:.6g} at {_moment(times_s[first])} ({int(wrong.sum())} such values); it lies "
             f"between {low:g} and {quantity.high:g}. Check the column and its unit."
         )
+
+
+def _check_shares(columns: Mapping[str, np.ndarray], source: str) -> None:
+    """Raises SceneError where humidity is given as a share in place of per cent."""
+    if "humidity_percent" in columns and 0 < (most := float(np.nanmax(columns["humidity_percent"]))) <= 1:
+        raise SceneError(
+            f"{source}: humidity_percent is {most:g} at the most, drier than any air. Shares are no per cent: name such a column "
+            "humidity_fraction, or multiply by 100"
+        )
+
+
+def _take_for_dry(columns: dict[str, np.ndarray], notes: dict[str, Any]) -> None:
+    """Fills rain with 0 where a record says nothing of it, as many do where none fell."""
+    for name in (RAIN, FALLEN):
+        if name in columns and (gaps := int(np.isnan(columns[name]).sum())):
+            columns[name] = np.nan_to_num(columns[name])
+            notes["dry"] = f"{gaps} samples without {name} are taken for dry"
+
+
+def _notes_of(times_s: np.ndarray, columns: Mapping[str, np.ndarray], absolute: bool) -> dict[str, Any]:
+    """What a record has and lacks, from when to when; ``absolute`` where its times are seconds since 1970 UTC."""
+    notes: dict[str, Any] = {}
+    if missing := [name for name in WEATHER_COLUMNS if name not in columns]:
+        notes["missing"] = ", ".join(missing)
+    if absolute:
+        notes["utc_at_zero_s"] = 0.0
+        notes["from_utc"], notes["to_utc"] = (utc_text(t) for t in (times_s[0], times_s[-1]))
+    notes["span_h"] = round((times_s[-1] - times_s[0]) / 3600.0, 3)
+    notes["step_min"] = round(float(np.median(np.diff(times_s))) / 60.0, 3)
+    notes["ranges"] = {name: [round(float(v.min()), 2), round(float(v.max()), 2)] for name, v in columns.items()}
+    return notes
 
 
 def _in_order(

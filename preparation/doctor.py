@@ -17,7 +17,7 @@ from heatsplat.datamodules.benchmark import Benchmark
 from heatsplat.datamodules.benchmark_folder import META, SCENES, TRUTH
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
-from heatsplat.datamodules.formats.radiometric import read_bytes
+from heatsplat.datamodules.formats.images import read_bytes
 from heatsplat.datamodules.nerfstudio import Nerfstudio, find_transforms
 from heatsplat.datamodules.ntr import NTR
 from heatsplat.datamodules.posed_frames import FILES

@@ -22,12 +22,13 @@ from heatsplat.datamodules.formats.images import (
     SUFFIXES,
     colour_levels,
     pages_of,
+    read_bytes,
     read_image,
     resized,
     shown_files,
     to_grey,
 )
-from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
+from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.datamodules.formats.temperature_table import MIN_SIDE, read_temperature_table
 from heatsplat.datamodules.formats.temperature_table import SUFFIX as TABLE
 from heatsplat.datamodules.timestamps import dji_time, instant, zone_of

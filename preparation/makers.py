@@ -14,7 +14,8 @@ import numpy as np
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats import dji, flir
 from heatsplat.datamodules.formats.exif import exif_in
-from heatsplat.datamodules.formats.radiometric import Calibration, read_bytes
+from heatsplat.datamodules.formats.images import read_bytes
+from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.physics.radiometry import Conditions, PlanckResponse
 from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.frame import Attitude, CameraInfo, Position, ThermalFrame, frame_name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, pairwise
@@ -290,39 +290,27 @@ class Search:
         lines = [
             f"{len(kept)} of {len(self.frames)} frames found their camera; {values['points']} points, reprojection error "
             f"{values['reprojection_error_px']:.2f} px.",
-            *(
-                f"Camera{f' {self.devices[i].label}' if len(self.devices) > 1 else ''}: {c.model.name}, "
-                f"{', '.join(f'{p:.5g}' for p in c.params)} (distortion is taken out of the temperatures when the scene is "
-                "loaded, as floating point)."
-                for i, c in cameras.items()
-            ),
+            *(self._camera_line(i, camera) for i, camera in cameras.items()),
+            _world_line(errors),
         ]
         if errors is not None:
             values["gps_residual_m"] = [round(float(e), 3) for e in errors]
-            lines.append(
-                f"World: east, north, up in metres of the first GPS fix; cameras lie {errors[0]:.2f} m beside and "
-                f"{errors[1]:.2f} m above or below their fixes (rms)."
-            )
-        else:
-            lines.append("World: scale and orientation of the reconstruction; no GPS that would tell them.")
         if self.options.by == "rgb":
             turn, offset = self._rig(model, written)
             values["thermal_from_rgb"] = {"degrees": turn, "offset": offset}
-            where = ", ".join(f"{x:.4g}" for x in offset)
-            lines.append(
-                f"The thermal camera is turned by {turn:.2f}° against the visible one and stands at ({where}) in its axes "
-                "(right, down, forward), as far as they tell: both are brought to the same places in the mean."
-            )
+            lines.append(_rig_line(turn, offset))
         if len(written.points3D) > 2:
             self._draw(written)
             lines += ["", f"![cameras over the points]({PICTURE})", ""]
-        if missing:
-            lines.append(
-                f"{counted(len(missing), 'frame')} without a camera, left out of training; more overlap between frames helps, "
-                "and photos of a camera beside (poses=rgb):"
-            )
-        lines += ["", *(f"- {name}: {reason}" for name, reason in missing.items())]
-        return Section("Poses", lines, values)
+        return Section("Poses", [*lines, *_missing_lines(missing)], values)
+
+    def _camera_line(self, device: int, camera: pycolmap.Camera) -> str:
+        """The lens that was found of a camera."""
+        which = f" {self.devices[device].label}" if len(self.devices) > 1 else ""
+        return (
+            f"Camera{which}: {camera.model.name}, {', '.join(f'{p:.5g}' for p in camera.params)} (distortion is taken out of the "
+            "temperatures when the scene is loaded, as floating point)."
+        )
 
     def _draw(self, written: pycolmap.Reconstruction) -> None:
         """The picture of the cameras, in the order of the frames."""
@@ -590,3 +578,35 @@ def _progress(items: Sequence[Any], what: str) -> Iterator[Any]:
         return iter(())
     log.info("%s", what)
     return iter(track(items, what, transient=True, disable=not get_console().is_terminal))
+
+
+# What the section says -----------------------------------------------------------------------------------------------
+
+
+def _world_line(errors: Sequence[float] | None) -> str:
+    """What the world's axes are, by how far cameras are beside and above their fixes in metres, or None without GPS."""
+    if errors is None:
+        return "World: scale and orientation of the reconstruction; no GPS that would tell them."
+    return (
+        f"World: east, north, up in metres of the first GPS fix; cameras lie {errors[0]:.2f} m beside and {errors[1]:.2f} m "
+        "above or below their fixes (rms)."
+    )
+
+
+def _rig_line(turn: float, offset: Sequence[float]) -> str:
+    where = ", ".join(f"{x:.4g}" for x in offset)
+    return (
+        f"The thermal camera is turned by {turn:.2f}° against the visible one and stands at ({where}) in its axes (right, down, "
+        "forward), as far as they tell: both are brought to the same places in the mean."
+    )
+
+
+def _missing_lines(missing: Mapping[str, str]) -> list[str]:
+    """Frames without a camera, each with the reason."""
+    lines = []
+    if missing:
+        lines = [
+            f"{counted(len(missing), 'frame')} without a camera, left out of training; more overlap between frames helps, and "
+            "photos of a camera beside (poses=rgb):"
+        ]
+    return [*lines, "", *(f"- {name}: {reason}" for name, reason in missing.items())]

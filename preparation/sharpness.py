@@ -1,4 +1,8 @@
-"""How sharp the frames of a recording are beside each other, and which of neighbours is the sharpest."""
+"""How sharp the frames of a recording are beside each other, and which of neighbours is the sharpest.
+
+The doctor measures otherwise (``doctor.checks.sharpness``): what it has falls further with blur, but tells frames that look at
+unlike parts of a scene half as well apart. Motion of 3 pixels is 1.6 standard deviations of it, and 3.2 of this one.
+"""
 
 from __future__ import annotations
 

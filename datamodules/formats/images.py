@@ -38,6 +38,14 @@ MOST_MAPPED = 2**31 - 1  # bytes that OpenCV decodes from memory
 PSEUDO_COLOUR_LEVELS = 4.0
 
 
+def read_bytes(path: Path) -> bytes:
+    """Content of an image file. Raises SceneError when it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
+
+
 def read_image(path: Path, page: int | None = None) -> np.ndarray:
     """The pixels of an image file as they are stored: [H, W] or [H, W, C], C = 3 (RGB) or 4 (RGBA).
 
@@ -84,10 +92,7 @@ def _in_utf8(path: Path) -> bool:
 
 
 def _only(path: Path) -> np.ndarray | None:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
+    data = read_bytes(path)
     if not data:
         raise SceneError(f"image {path} is empty (0 bytes); copy it again or remove it from the scene")
     if data[:2] == b"\xff\xd8" and _is_truncated_jpeg(data):

@@ -146,49 +146,60 @@ def lens_in(transforms: Transforms, frame: dict[str, Any], size: Callable[[], tu
     Raises:
         SceneError: no focal length, a camera model that is not supported, or distortion that the model does not have.
     """
+    source = f"{transforms.path}, {frame['file_path']}"
     values = {**transforms.values, **frame}
     for axis in "xy":  # a frame's own field of view goes before the file's focal length
         if f"camera_angle_{axis}" in frame and f"fl_{axis}" not in frame:
             values.pop(f"fl_{axis}", None)
-    said = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")).upper()
-    model = _COLMAP_NAME.get(said, said)
-    source = f"{transforms.path}, {frame['file_path']}"
-    if values.get("is_fisheye") and "FISHEYE" not in model:
-        raise SceneError(f"{source}: is_fisheye is true, but camera_model is {said}; keep one of them")
-    if model not in MODELS:
-        lens_of(model, (), 0, 0, source)  # raises, naming the supported models
-
-    def number(key: str, default: float = 0.0) -> float:
-        return finite(values.get(key, default), f"{source}: {key}")
-
-    has = set(MODELS[model].split()) - set(_OTHER_POLYNOMIAL if said == "OPENCV" else ())
-    if beyond := next((key for key in _COEFFICIENTS if key not in has and values.get(key) and number(key)), None):
-        meant = "FULL_OPENCV" if beyond in _OTHER_POLYNOMIAL else "OPENCV"
-        meant = "OPENCV_FISHEYE" if "FISHEYE" in model else meant
-        raise SceneError(
-            f"{source}: {beyond} is {number(beyond):g}, and camera model {said} has no {beyond}; "
-            + ("" if meant == said else f"say camera_model {meant} if it is one of that, or ")
-            + f"undistort the images and take {beyond} out"
-        )
-    sized = "w" in values and "h" in values
-    width, height = (int(number("w")), int(number("h"))) if sized else size()
-    if not sized and not (0 <= number("cx") <= width and 0 <= number("cy") <= height):
-        raise SceneError(
-            f"{source}: the principal point {number('cx'):g}, {number('cy'):g} lies outside its image of {width}x{height}, and w "
-            "and h are missing: give those of the images that focal length and principal point are for"
-        )
+    model = _model_of(values, source)
+    width, height = _size_of(values, size, source)
     fx = _focal(values, "x", width, source)
     if fx is None:
         raise SceneError(f"{source}: no focal length; fl_x or camera_angle_x is needed")
     fy = _focal(values, "y", height, source)
     if fy is not None and fy != fx:
         model = _OF_TWO.get(model, model)
-    known = {
-        "f": fx,
-        "fx": fx,
-        "fy": fx if fy is None else fy,
-        "cx": number("cx", width / 2),
-        "cy": number("cy", height / 2),
-    }
-    params = [known[key] if key in known else number(key) for key in MODELS[model].split()]
+    known = {"f": fx, "fx": fx, "fy": fx if fy is None else fy}
+    known |= {"cx": _number(values, "cx", source, width / 2), "cy": _number(values, "cy", source, height / 2)}
+    params = [known[key] if key in known else _number(values, key, source) for key in MODELS[model].split()]
     return lens_of(model, params, width, height, source)
+
+
+def _number(values: dict[str, Any], key: str, source: str, default: float = 0.0) -> float:
+    return finite(values.get(key, default), f"{source}: {key}")
+
+
+def _model_of(values: dict[str, Any], source: str) -> str:
+    """COLMAP's name of a camera model. Raises SceneError for one that is not supported or lacks a coefficient that is given."""
+    said = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")).upper()
+    model = _COLMAP_NAME.get(said, said)
+    fisheye = "FISHEYE" in model
+    if values.get("is_fisheye") and not fisheye:
+        raise SceneError(f"{source}: is_fisheye is true, but camera_model is {said}; keep one of them")
+    if model not in MODELS:
+        lens_of(model, (), 0, 0, source)  # raises, naming the supported models
+    has = set(MODELS[model].split()) - set(_OTHER_POLYNOMIAL if said == "OPENCV" else ())
+    for key in _COEFFICIENTS:
+        if key in has or not values.get(key) or not (given := _number(values, key, source)):
+            continue
+        meant = "OPENCV_FISHEYE" if fisheye else "FULL_OPENCV" if key in _OTHER_POLYNOMIAL else "OPENCV"
+        instead = "" if meant == said else f"say camera_model {meant} if it is one of that, or "
+        raise SceneError(
+            f"{source}: {key} is {given:g}, and camera model {said} has no {key}; {instead}undistort the images and take "
+            f"{key} out"
+        )
+    return model
+
+
+def _size_of(values: dict[str, Any], size: Callable[[], tuple[int, int]], source: str) -> tuple[int, int]:
+    """Width and height of the images that the numbers are for. Raises SceneError where the stored one cannot be meant."""
+    if "w" in values and "h" in values:
+        return int(_number(values, "w", source)), int(_number(values, "h", source))
+    width, height = size()
+    cx, cy = _number(values, "cx", source), _number(values, "cy", source)
+    if not (0 <= cx <= width and 0 <= cy <= height):
+        raise SceneError(
+            f"{source}: the principal point {cx:g}, {cy:g} lies outside its image of {width}x{height}, and w and h are missing: "
+            "give those of the images that focal length and principal point are for"
+        )
+    return width, height

@@ -16,7 +16,7 @@ from torch import Tensor
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.bounds import MAX_CELSIUS
 from heatsplat.datamodules.formats import dji, flir
-from heatsplat.datamodules.formats.images import read_image, tiff_text
+from heatsplat.datamodules.formats.images import read_bytes, read_image, tiff_text
 from heatsplat.datamodules.side_files import says_fahrenheit, says_kelvin
 from heatsplat.physics.radiometry import BandResponse, Conditions, Response, surface_temperature
 from heatsplat.physics.units import KELVIN_AT_0_C, MAYBE_KELVIN
@@ -71,14 +71,6 @@ def surface_celsius(stored: np.ndarray, calibration: Calibration, conditions: Co
     celsius = (kelvin.numpy() - KELVIN_AT_0_C).astype(np.float32)
     celsius[celsius > MAX_CELSIUS] = np.nan
     return celsius[where].reshape(stored.shape)
-
-
-def read_bytes(path: Path) -> bytes:
-    """Content of a file. Raises SceneError when it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise SceneError(f"image {path} cannot be read: {error.strerror}") from error
 
 
 def has_temperatures(path: Path) -> bool:

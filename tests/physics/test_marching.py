@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 import torch
 
-from heatsplat.kernels import heat_balance as kernels
+from heatsplat.kernels import marching as kernels
 from heatsplat.physics import marching
 from heatsplat.physics.energy_balance import Climate
 from heatsplat.physics.marching import (

@@ -60,22 +60,50 @@ def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves
     What other callbacks did not leave in the folder is left out.
     """
     content = results.as_json()
-    run, reasons = content["run"], content["reasons"]
-    lines = [f"# {run.get('method') or run.get('thermal_model')} on {plain(str(run.get('scene')))}", ""]
+    run = content["run"]
+    entries = citations(run.get("method"))
+    lines = [
+        f"# {run.get('method') or run.get('thermal_model')} on {plain(str(run.get('scene')))}",
+        *_scores_section(content),
+        *_views_section(pictures, folder),
+        *_picture_section("Around the scene", folder, TURNTABLE_FILE, "the scene, turning"),
+        *_curves_section(curves, folder),
+        *_picture_section("Temperature over time", folder, PROBES_PICTURE, "probes"),
+        *_picture_section("What all surfaces or images share over time", folder, COURSES_PICTURE, "learned courses"),
+        *_surfaces_section(folder),
+        *learned_section(folder),
+        *("", "## The run", "", *_told_lines(run, RUN_WORDS)),
+        *_effects_section(content["effects"]),
+        *("", "## Data: findings and assumptions", "", *data_lines(content["data"])),
+        *("", f"## {DEFINITIONS_TITLE}", "", *_definition_lines(content["definitions"])),
+        *("", "## Versions", "", *_bullets(content["versions"])),
+        *(("", "## How to cite", "", *(f"- {entry}" for entry in entries)) if entries else ()),
+    ]
+    return "\n".join([*lines, ""])
+
+
+def _scores_section(content: Mapping[str, Any]) -> list[str]:
+    """Scores beside cost, and why some are not there."""
     told = (
         [(_labelled(words, name), value) for name, words, value in cells(content, part)] for part in ("test", "cost")
     )
     pairs = zip_longest(*told, fillvalue=("", ""))
     table = markdown_table(("score", "value", "", "cost", "value"), [(*score, "", *cost) for score, cost in pairs])
-    lines += ["## Scores and cost", "", *table, "", f"What each score is stands below, under {DEFINITIONS_TITLE}."]
+    lines = ["", "## Scores and cost", "", *table, "", f"What each score is stands below, under {DEFINITIONS_TITLE}."]
     missing: dict[str, list[str]] = {}
     for name in (f"{part}.{score}" for part in ("test", "cost") for score in content[part]):
-        if name in reasons:
-            missing.setdefault(reasons[name], []).append(f"`{name}`")
+        if name in content["reasons"]:
+            missing.setdefault(content["reasons"][name], []).append(f"`{name}`")
     if missing:
         lines += ["", "Not available:", "", *(f"- {', '.join(names)}: {reason}" for reason, names in missing.items())]
     if content["data"].get(IN_BOTH):
         lines += ["", f"**{content['data'][IN_BOTH]}.**"]
+    return lines
+
+
+def _views_section(pictures: Sequence[Path], folder: Path) -> list[str]:
+    """The scene in a browser, and test views."""
+    lines = []
     if (folder / VIEWER_FILE).exists():
         lines += ["", f"Interactive 3D view with temperatures: [{VIEWER_FILE}]({VIEWER_FILE})."]
     if pictures:
@@ -84,22 +112,15 @@ def markdown(results: RunResults, folder: Path, pictures: Sequence[Path], curves
             lines += [_picture(path, folder), ""]
         if (folder / TEST_FILE).exists():
             lines.append(f"Scores of each test image: [{TEST_FILE}]({TEST_FILE}).")
-    lines += _picture_section("Around the scene", folder, TURNTABLE_FILE, "the scene, turning")
-    if curves is not None:
-        lines += ["", "## Quality over training time", "", f"![scores]({curves.relative_to(folder).as_posix()})"]
-        lines += ["", f"Values: [{CURVE_FILE}]({CURVE_FILE})."]
-    lines += _picture_section("Temperature over time", folder, PROBES_PICTURE, "probes")
-    lines += _picture_section("What all surfaces or images share over time", folder, COURSES_PICTURE, "learned courses")
-    lines += _surfaces_section(folder)
-    lines += learned_section(folder)
-    lines += ["", "## The run", "", *_told_lines(run, RUN_WORDS)]
-    lines += _effects_section(content["effects"])
-    lines += ["", "## Data: findings and assumptions", "", *data_lines(content["data"])]
-    lines += ["", f"## {DEFINITIONS_TITLE}", "", *_definition_lines(content["definitions"])]
-    lines += ["", "## Versions", "", *_bullets(content["versions"])]
-    if entries := citations(run.get("method")):
-        lines += ["", "## How to cite", "", *(f"- {entry}" for entry in entries)]
-    return "\n".join([*lines, ""])
+    return lines
+
+
+def _curves_section(curves: Path | None, folder: Path) -> list[str]:
+    """Scores over seconds of training."""
+    if curves is None:
+        return []
+    picture = f"![scores]({curves.relative_to(folder).as_posix()})"
+    return ["", "## Quality over training time", "", picture, "", f"Values: [{CURVE_FILE}]({CURVE_FILE})."]
 
 
 def _picture(path: Path, folder: Path, alternative: str | None = None) -> str:
@@ -292,22 +313,28 @@ def _in_words(name: str, value: Any, known: Words) -> tuple[str, str]:
     words, unit = known.get(name) or words_and_unit(name)
     if name in RISE_WORDS and isinstance(value, float) and value < 0:
         words, value = RISE_WORDS[name], -value
+    if name == "views" and isinstance(value, Mapping):
+        return words, ", ".join(f"{_words(count)} {PARTS.get(part, part)}" for part, count in value.items())
     if isinstance(value, Mapping):
-        if name == "views":
-            return words, ", ".join(f"{_words(count)} {PARTS.get(part, part)}" for part, count in value.items())
         told = (item for item in value.items() if TWICE.get(item[0]) not in value and item[1] not in ("", []))
         return words, ", ".join(" ".join(_in_words(*item, known)) for item in told) or "on"
+    return words, _with_unit(name, value, unit)
+
+
+def _with_unit(name: str, value: Any, unit: str) -> str:
+    """A value, or a list of them, for people; ``name`` tells moments and lengths of time."""
     values = value if isinstance(value, list | tuple) else [value]
     numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
-    if name in CLOCKS and numbers:
-        return words, Clock(value, CLOCKS[name]).at(0.0, "seconds")
-    if name == "seconds" and numbers:
-        return words, moment(value)
-    if unit == "%" and numbers:
-        return words, f"{100 * value:.3g} %"
+    if numbers and name in CLOCKS:
+        return Clock(value, CLOCKS[name]).at(0.0, "seconds")
+    if numbers and name == "seconds":
+        return moment(value)
+    if numbers and unit == "%":
+        return f"{100 * value:.3g} %"
     told = (" to " if unit and numbers and len(values) == 2 else ", ").join(map(_words, values))
+    told = DATA_VALUES.get(told, told)
     sized = unit == "pixels" and value is not None  # sizes are text, such as 40x32
-    return words, f"{DATA_VALUES.get(told, told)} {unit}".rstrip() if numbers or sized else DATA_VALUES.get(told, told)
+    return f"{told} {unit}".rstrip() if numbers or sized else told
 
 
 def _bullets(values: Mapping[str, Any]) -> list[str]:

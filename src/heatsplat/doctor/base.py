@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.contracts import Camera, Frame, SceneData, View
-from heatsplat.effects.observations import Tracks, frames_to_follow, read, tracks_of
+from heatsplat.effects.observations import Tracks, difference_told, frames_to_follow, read, tracks_of
 from heatsplat.effects.weather_record import QUICK_PER_S, SLOW_PER_S, drivers
 from heatsplat.physics.noise import noise_of, quantum_of
 
@@ -206,7 +206,7 @@ class Material:
 
     def size(self, value: float) -> str:
         """A difference of values in words."""
-        return f"{100 * value:.2g} % of the range" if self.unit_k is None else f"{value * self.unit_k:.2g} K"
+        return difference_told(value, self.unit_k)
 
 
 @dataclass(frozen=True)
@@ -291,21 +291,16 @@ def _poses(scene: SceneData) -> dict[str, str]:
     return {"poses_in": files, "poses_are": f"camera-to-world in {axes}"} if axes.endswith(" axes") else {}
 
 
-def coarse(image: Tensor) -> Tensor:
-    """An image [h, w] float64 with COARSE pixels along its shorter side, by means over areas of [H, W]; as it is where it has
+def coarse(image: Tensor, side: int = COARSE) -> Tensor:
+    """An image [h, w] float64 with so many pixels along its shorter side, by means over areas of [H, W]; as it is where it has
     no more, and 0 where nothing is known."""
-    scale = max(1.0, min(image.shape) / COARSE)
+    scale = max(1.0, min(image.shape) / side)
     return shrunk(image, (round(image.shape[0] / scale), round(image.shape[1] / scale)))
 
 
 def shrunk(image: Tensor, size: tuple[int, int]) -> Tensor:
     """An image [H, W] on a grid (height, width), float64, by means over areas; 0 where nothing is known."""
     return functional.interpolate(image[None, None].double().nan_to_num(), size, mode="area")[0, 0]
-
-
-def unit(patterns: Tensor) -> Tensor:
-    """Patterns [..., n] without their means and of length 1, whose products are correlations."""
-    return functional.normalize(patterns - patterns.mean(-1, keepdim=True), dim=-1)
 
 
 def _lenses(frames: Sequence[Frame]) -> list[int]:

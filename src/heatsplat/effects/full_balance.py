@@ -16,12 +16,12 @@ from torch import Tensor
 
 from heatsplat.contracts import Weather
 from heatsplat.effects.joint.held_out import FOLDS, WORST, fold_of
+from heatsplat.physics.drivers import of_sky, of_sunlight, of_water
 from heatsplat.physics.energy_balance import Climate
 from heatsplat.physics.marching import march
 from heatsplat.physics.responses import driver_means
-from heatsplat.physics.surfaces import Core, Drivers, Surface, power_excess
+from heatsplat.physics.surfaces import Core, Drivers, Surface
 from heatsplat.physics.units import DAY_S, celsius, kelvin
-from heatsplat.physics.wetness import drying_mm_s_k, vapour_k
 
 # Of bodies with a core (``physics.marching.UNITS``): the limits of what has some, and what a number before its sigmoid, or as it
 # is, is expected to be, with a standard deviation. A surface starts about its own mean, a core about the mean of the air.
@@ -150,27 +150,20 @@ class FullBalance:
 
     @cached_property
     def _climate(self) -> Climate:
-        """Drivers as ``thermal.surface_drivers`` gives them to a balance in training; effects import no thermal models."""
+        """The climate of the record, from ``MEMORY_S`` before the first frame."""
         weather = self.weather
         forgotten = int((weather.times_s < float(self.times_s.min()) - MEMORY_S).sum())
         kept = slice(min(max(forgotten - 1, 0), len(weather.times_s) - 2), None)
         reference_k = float(kelvin(driver_means(weather.times_s, weather.air_c)))
-        air = kelvin(weather.air_c) - reference_k
-        drivers = {"air": air, "sky": power_excess(self.sky_k - reference_k, reference_k)}
+        drivers = {"air": kelvin(weather.air_c) - reference_k}
+        drivers |= of_sunlight(weather, tilted=self.normals is not None)
+        drivers |= of_sky(weather, self.sky_k, reference_k, tilted="beams" in drivers)
+        drivers |= of_water(weather, self.film_mm, self.transpires)
         if weather.wind_m_s is not None and bool((weather.wind_m_s > 0).any()):
             drivers["wind_anomaly"] = weather.wind_m_s / driver_means(weather.times_s, weather.wind_m_s) - 1.0
-        if None not in (self.normals, weather.sun, weather.direct_w_m2, weather.diffuse_w_m2):
-            drivers |= {"around": power_excess(air, reference_k), "light": weather.diffuse_w_m2 / 1000.0}
-            drivers["beams"] = weather.direct_w_m2[:, None] * weather.sun / 1000.0
-        elif weather.irradiance_w_m2 is not None:
-            drivers["light"] = weather.irradiance_w_m2 / 1000.0
-        if self.film_mm is not None:
-            drivers |= {"rain": weather.rain_mm_h / 3600.0, "dries": drying_mm_s_k(weather)}
-        if self.film_mm is not None or self.transpires:
-            drivers["vapour"] = vapour_k(kelvin(weather.air_c), weather.humidity_percent)
-        up = weather.up.double() if "beams" in drivers else None
+        lasting = {name: drivers.pop(name) for name in ("up", "holds_mm") if name in drivers}
         series = {name: values[kept] for name, values in drivers.items()}
-        return Climate(Drivers(weather.times_s[kept], reference_k, up=up, holds_mm=self.film_mm or 0.0, **series))
+        return Climate(Drivers(weather.times_s[kept], reference_k, **series, **lasting))
 
     @cached_property
     def _names(self) -> list[str]:

@@ -99,7 +99,7 @@ class Observations:
 
     def size(self, value: float) -> str:
         """A difference of image values in words: in kelvin where they are temperatures."""
-        return f"{100 * value:.2g} % of the range" if self.unit_k is None else f"{value * self.unit_k:.2g} K"
+        return difference_told(value, self.unit_k)
 
     @property
     def ambient(self) -> float | None:
@@ -133,6 +133,16 @@ def observe(scene: SceneData) -> Observations:
         if tracks is None:
             why = f"no scene point is seen in {MIN_FRAMES} or more of {len(frames)} training views"
     return Observations(scene, tuple(frames), images, masks, times_s, noise, still, tracks, why)
+
+
+def difference_told(value: float, unit_k: float | None) -> str:
+    """A difference of image values in words, of so many kelvin to 1; None where they are no temperatures."""
+    return f"{100 * value:.2g} % of the range" if unit_k is None else f"{value * unit_k:.2g} K"
+
+
+def standardised(patterns: Tensor) -> Tensor:
+    """Patterns [..., n] without their means and of length 1, whose products are correlations."""
+    return functional.normalize(patterns - patterns.mean(-1, keepdim=True), dim=-1)
 
 
 def _too_little(scene: SceneData, frames: int, shape: Sequence[int], still: bool) -> str:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.contracts import Camera, SceneData, View, evenly_spread
+from heatsplat.effects.observations import standardised
 from heatsplat.geometry.projection import to_camera, to_world
 from heatsplat.physics.noise import noise_of, quantum_of
 
@@ -96,7 +97,7 @@ def _swept(
     patches, places = _textured(images[k], noise)
     if not len(patches):
         return images[k].new_zeros(0, 3)
-    own, at = _standard(patches), _block(camera) * places
+    own, at = standardised(patches), _block(camera) * places
     rays = torch.linalg.solve(camera.K, torch.cat([at, torch.ones_like(at[..., :1])], 2)[..., None])[..., 0]
     away = float((middle - camera.center).norm())
     depths = 1.0 / torch.linspace(1.0 / (FARTHEST * away), 1.0 / (NEAREST * away), DEPTHS, dtype=torch.float64)
@@ -153,10 +154,5 @@ def _alike(own: Tensor, rays: Tensor, depths: Tensor, viewmat: Tensor, camera: C
     positions = 2.0 * pixels / (_block(camera) * pixels.new_tensor([width, height])) - 1.0
     inside = (ahead & (positions.abs() < 1.0).all(1)).view(points.shape[:3]).all(2)
     values = functional.grid_sample(image[None, None], positions[None, None], align_corners=False)[0, 0, 0]
-    correlation = (_standard(values.view(points.shape[:3])) * own[:, None]).sum(2)
+    correlation = (standardised(values.view(points.shape[:3])) * own[:, None]).sum(2)
     return torch.where(inside, correlation, torch.nan)
-
-
-def _standard(patches: Tensor) -> Tensor:
-    """Patches [..., q] without their mean, of length 1."""
-    return functional.normalize(patches - patches.mean(-1, keepdim=True), dim=-1)

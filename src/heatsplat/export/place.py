@@ -2,33 +2,27 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 import math
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from heatsplat.contracts import Camera, Frame, SceneData, SceneError, number_in, table_lines, text_in
+from heatsplat.contracts import Camera, SceneData, SceneError
+from heatsplat.export.camera_positions import named, read_positions
 from heatsplat.export.formats.base import optional
 from heatsplat.export.moment import Moment
 from heatsplat.geometry.alignment import Similarity, similarity_between
 from heatsplat.geometry.rotations import matrices_to_quats, quats_to_matrices
 from heatsplat.geometry.trajectories import upward
-from heatsplat.io.tables import SPELLINGS
 
 log = logging.getLogger("heatsplat")
 
-# Columns of a table of positions, as preparation writes them and as others do.
-NAMES, LATITUDES, LONGITUDES = (SPELLINGS[key] for key in ("name", "latitude_deg", "longitude_deg"))
-HEIGHTS = ("above_takeoff_m", "altitude_m", "altitude", "rel_alt", "alt")
-LEVEL = "no height"  # column that stands for them where a table has none
 AUTO = "auto"
 LOOSE = 0.7  # share of how far positions are from their middle by which cameras may be off them (rms): half of their variance
 LEAST_SPREAD = 0.1  # positions whose second extent is below this share of the first lie on a line
@@ -164,10 +158,10 @@ def upright(moment: Moment) -> tuple[Tensor, Tensor, Tensor]:
 
 def _placed(scene: SceneData, path: Path) -> Place:
     """By the shift, or else the similarity, that brings the cameras closest to their positions."""
-    positions = _positions(path, flat=_east_north_up(scene))
+    positions = read_positions(path, flat=_east_north_up(scene))
     found = {
         frame.camera.center: positions[name]
-        for frame, name in zip(scene.frames, _named(scene.frames, positions), strict=True)
+        for frame, name in zip(scene.frames, named(scene.frames, positions), strict=True)
         if name is not None
     }
     if len(found) < 3:
@@ -252,75 +246,3 @@ def _grid_north(warp: Any, crs: str, latitude: float, longitude: float) -> tuple
     metres = step * (111132.954 - 559.822 * math.cos(angle) + 1.175 * math.cos(2 * angle))  # of the meridian, WGS 84
     east, north = warp.transform("EPSG:4326", crs, [longitude] * 2, [latitude - step / 2, latitude + step / 2])
     return (east[1] - east[0]) / metres, (north[1] - north[0]) / metres
-
-
-def _named(frames: Sequence[Frame], positions: Mapping[str, Any]) -> list[str | None]:
-    """By which name the position of each image is known: its own, or that of its file where no other has it."""
-    stems = Counter(PurePosixPath(name).name for name in positions)
-    alone = {stem: name for stem, name in ((PurePosixPath(name).name, name) for name in positions) if stems[stem] == 1}
-    ours = Counter(PurePosixPath(_without_ending(frame.name)).name for frame in frames)
-    found = []
-    for frame in frames:
-        whole = _without_ending(frame.name)
-        stem = PurePosixPath(whole).name
-        found.append(whole if whole in positions else alone.get(stem) if ours[stem] == 1 else None)
-    return found
-
-
-def _positions(path: Path, flat: bool = False) -> dict[str, tuple[float, float, float]]:
-    """Latitude, longitude and height by name without ending; rows without a position are left out, as are those of latitude and
-    longitude 0, which receivers tell until they know better.
-
-    Heights are those of the first column that has any: a preparation writes a column for each kind, empty where files do not
-    say it. ``flat`` takes 0 where none has.
-    """
-    rows = _rows(path)
-    # Without None, under which stands what a row has beyond the last column.
-    there = [column for column in rows[0] if column is not None] if rows else []
-    filled = {column for column in there if any(_told(row, column) for row in rows)}
-    columns = []
-    for wanted in (NAMES, LATITUDES, LONGITUDES, HEIGHTS):
-        found = [column for column in wanted if column in there]
-        column = next((column for column in found if column in filled), None)
-        if column is None and flat and wanted is HEIGHTS:
-            for row in rows:
-                row[LEVEL] = "0"
-            column = LEVEL
-        elif not found:
-            raise SceneError(f"{path} has no column {' or '.join(wanted)}")
-        columns.append(column or found[0])
-    name, *numbers = columns
-    try:
-        found = {
-            _without_ending(row[name]): tuple(number_in(_told(row, n).replace(",", ".")) for n in numbers)
-            for row in rows
-            if all(_told(row, n) for n in columns)
-        }
-    except ValueError as error:
-        raise SceneError(f"{path}: {error} in {', '.join(numbers)}") from error
-    found = {name: place for name, place in found.items() if all(map(math.isfinite, place)) and any(place[:2])}
-    if wrong := [
-        name for name, (latitude, longitude, _) in found.items() if abs(latitude) > 90 or abs(longitude) > 360
-    ]:
-        raise SceneError(f"{path}: {wrong[0]} lies nowhere on the earth, at latitude {found[wrong[0]][0]:g} and longitude "
-                         f"{found[wrong[0]][1]:g} degrees")  # fmt: skip
-    return found
-
-
-def _rows(path: Path) -> list[dict[str, str | None]]:
-    try:
-        lines = [line for _, line in table_lines(text_in(path.read_bytes()))]
-        return list(csv.DictReader(lines, delimiter=max(",;\t", key=(lines or [""])[0].count)))
-    except (OSError, ValueError, csv.Error) as error:
-        raise SceneError(f"{path} cannot be read: {error}") from error
-
-
-def _told(row: Mapping[str, str | None], column: str) -> str:
-    """What a row says in a column, which short rows lack; empty for blanks."""
-    return (row[column] or "").strip()
-
-
-def _without_ending(name: str) -> str:
-    """A file's name without its ending, which begins with a letter: that of "2024-08-06_17.34.49" has none."""
-    path = PurePosixPath(Path(name.strip()).as_posix())
-    return (path.with_suffix("") if path.suffix[1:2].isalpha() else path).as_posix()

@@ -1,6 +1,6 @@
 """The heat balance as it stands, with T⁴ and gusts of wind, marched along the record for many moments at once.
 
-``Climate`` in heatsplat.physics.energy_balance says what the symbols mean; the kernel is in heatsplat.kernels.heat_balance. A
+``Climate`` in heatsplat.physics.energy_balance says what the symbols mean; the kernel is in heatsplat.kernels.marching. A
 march passes the whole record whatever is asked of it, so that it is worth keeping. Who learns keeps temperatures and their
 derivatives at the moments of all training frames (``Kept``): as long as parameters stay near those that were marched,
 a temperature is a sum of few products. Who looks keeps the state at samples of the record (``Course``): the next frame goes
@@ -22,7 +22,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from heatsplat.kernels import heat_balance as kernels
+from heatsplat.kernels import marching as kernels
+from heatsplat.kernels.heat_balance import Balance
 from heatsplat.physics.energy_balance import Climate
 from heatsplat.physics.responses import driver_means, interval_of
 from heatsplat.physics.surfaces import Surface
@@ -104,7 +105,7 @@ def march(
         has += [surface.inner is not None, surface.core is not None, rained, surface.transpires is not None]
         seen = given.new_empty(len(given), 0) if surface.exposure.sun is None else surface.exposure.sun.to(given)
         kernels.march(
-            kernels.Balance(*has, sensitive),
+            Balance(*has, sensitive),
             first,
             columns[order].cpu().contiguous().numpy(),
             seen[order].detach().cpu().contiguous().numpy(),

@@ -2,7 +2,7 @@
 
 The light on a surface is taken at the samples of the record, max(n · beam_k, 0), and is linear between them; a shaded
 surface and the night are exactly zero. The last 12 to 24 hours are summed sample by sample with the surface's own normal and
-rate (heatsplat.kernels.heat_balance). What came before only decides where that sum starts: it is tabulated every 12 hours on
+rate (heatsplat.kernels.sunlight). What came before only decides where that sum starts: it is tabulated every 12 hours on
 a grid of normals and rates, on which twelve hours later hardly anything sharp is left. So a surface costs the same in any record.
 
 **Error:** the sum is exact. Of a beam that would heat by 60 K the tables miss 0.2 mK (root mean square), 2 mK in one of a
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.derivatives import once_differentiable
-from heatsplat.kernels import heat_balance as kernels
+from heatsplat.kernels import sunlight as kernels
 from heatsplat.physics.responses import cubics, driver_means, grid_position, interval_of, log_rate_grid, step_weights
 
 ANCHOR_S = 12 * 3600.0  # between two tables of what came before

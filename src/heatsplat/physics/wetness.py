@@ -2,7 +2,7 @@
 
 Water on a surface evaporates as its heat is carried off (Lewis 1922): a flux of sensible heat h (T - T_air) comes with one of
 latent heat h L (ρ_sat(T) - ρ_v), with vapour densities and L = Λ / (ρ c) of air. A film of water dries by that at the surface's
-own temperature: ``march`` in heatsplat.kernels.heat_balance has what air holds from ``vapour_k`` and ``drying_mm_s_k``.
+own temperature: ``march`` in heatsplat.kernels.marching has what air holds from ``vapour_k`` and ``drying_mm_s_k``.
 
 **Convention:** kelvin, seconds, kg of water a square metre, which are millimetres; [T] float64 on the record's times.
 """

@@ -144,10 +144,9 @@ def _check_gaussians(
     signs: Tensor | None,
 ) -> None:
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "features": features}
-    given |= {"background": background, "signs": signs}
+    given |= {name: value for name, value in (("background", background), ("signs", signs)) if value is not None}
     for name, value in given.items():
-        missing = value is None and name in ("background", "signs")
-        if not (missing or isinstance(value, Tensor) or (name == "features" and callable(value))):
+        if not (isinstance(value, Tensor) or (name == "features" and callable(value))):
             raise ValueError(f"{name} must be a tensor, got {_of_type(value)}: torch.as_tensor makes one")
     n = means.shape[0] if means.ndim else 0
     for name, tensor, shape in (("means", means, (n, 3)), ("quats", quats, (n, 4)), ("scales", scales, (n, 3))):
@@ -157,12 +156,9 @@ def _check_gaussians(
         raise ValueError(f"opacities must have shape [{n}] or [M, {n}], got {list(opacities.shape)}")
     if means.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"Gaussians must be float32 or float64, got means of {means.dtype}")
-    for name, tensor in given.items():
-        if (
-            name != "signs"
-            and isinstance(tensor, Tensor)
-            and (tensor.dtype != means.dtype or tensor.device != means.device)
-        ):
+    alike = {name: value for name, value in given.items() if isinstance(value, Tensor) and name != "signs"}
+    for name, tensor in alike.items():
+        if tensor.dtype != means.dtype or tensor.device != means.device:
             raise ValueError(
                 f"{name} must be like means, {means.dtype} on {means.device}, got {tensor.dtype} on {tensor.device}"
             )
@@ -190,22 +186,9 @@ def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, near: f
         )
     # On a GPU a look at them would wait for the device.
     if Ks.device.type == "cpu":
-        (fx, skew, cx), (below, fy, cy), last = Ks.detach().tolist()
-        if skew:
-            raise ValueError(f"Ks has a skew of {skew:.6g} (its [0, 1]), which no renderer has: undistort images to 0")
-        if not (fx > 0 and fy > 0):
-            raise ValueError(f"Ks needs fx and fy above 0 pixels (its [0, 0] and [1, 1]), got {fx:.6g} and {fy:.6g}")
-        if below or last != [0.0, 0.0, 1.0] or not all(map(math.isfinite, (fx, fy, cx, cy))):
-            raise ValueError(f"Ks must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of finite numbers, got {Ks.tolist()}")
+        _check_intrinsics(Ks)
     if viewmats.device.type == "cpu":
-        if not bool(viewmats.detach().isfinite().all()):
-            raise ValueError("viewmats has NaN or infinite values")
-        last = viewmats[3].tolist()
-        if max(abs(number - wanted) for number, wanted in zip(last, (0.0, 0.0, 0.0, 1.0), strict=True)) > LAST_ROW:
-            raise ValueError(
-                f"viewmats must map world to camera, with 0, 0, 0, 1 in its last row, got {last}: is it transposed, as 3DGS "
-                "has its world_view_transform?"
-            )
+        _check_pose(viewmats)
     if not 0 < eps2d < math.inf:
         raise ValueError(f"eps2d must be above 0 pixels² (3DGS: 0.3, Mip-Splatting: 0.1) and finite, got {eps2d}")
     if not 0 <= near < far:
@@ -214,6 +197,27 @@ def _check_camera(viewmats: Tensor, Ks: Tensor, width: int, height: int, near: f
         raise ValueError(f"width and height must be whole numbers of pixels, got {width!r} and {height!r}")
     if width < 1 or height < 1:
         raise ValueError(f"image must have pixels, got {width} x {height}")
+
+
+def _check_intrinsics(Ks: Tensor) -> None:
+    (fx, skew, cx), (below, fy, cy), last = Ks.detach().tolist()
+    if skew:
+        raise ValueError(f"Ks has a skew of {skew:.6g} (its [0, 1]), which no renderer has: undistort images to 0")
+    if not (fx > 0 and fy > 0):
+        raise ValueError(f"Ks needs fx and fy above 0 pixels (its [0, 0] and [1, 1]), got {fx:.6g} and {fy:.6g}")
+    if below or last != [0.0, 0.0, 1.0] or not all(map(math.isfinite, (fx, fy, cx, cy))):
+        raise ValueError(f"Ks must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] of finite numbers, got {Ks.tolist()}")
+
+
+def _check_pose(viewmats: Tensor) -> None:
+    if not bool(viewmats.detach().isfinite().all()):
+        raise ValueError("viewmats has NaN or infinite values")
+    last = viewmats[3].tolist()
+    if max(abs(number - wanted) for number, wanted in zip(last, (0.0, 0.0, 0.0, 1.0), strict=True)) > LAST_ROW:
+        raise ValueError(
+            f"viewmats must map world to camera, with 0, 0, 0, 1 in its last row, got {last}: is it transposed, as 3DGS "
+            "has its world_view_transform?"
+        )
 
 
 def _of_type(value: object) -> str:

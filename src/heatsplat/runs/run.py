@@ -303,13 +303,7 @@ def load(
     config = trusted(stored_config(loaded), checkpoint, _names(trust))
     if not {"module", "data"} <= config.keys():
         raise SceneError(f"{checkpoint} was not written by heatsplat")
-    changed = {key: None if value == "null" else value for key, value in (data or {}).items() if value is not None}
-    if "root" in changed:
-        changed["root"] = str(Path(changed["root"]).expanduser().resolve())
-    if changed.get("split", "list") != "list" and config["data"].get("split_file"):
-        changed = {"split_file": None} | changed  # which belongs to the rule of training
-    if "weather" in changed and "weather" not in config["data"]:
-        raise SceneError(f"data.weather={changed['weather']}: the data set of this checkpoint has no weather to choose")
+    changed = _changed(config["data"], data or {})
     with _naming(checkpoint):
         module = build_module(config, Path(output_dir))
     if weather is not None and "weather" not in module.thermal.needs:
@@ -327,15 +321,32 @@ def load(
     if weather is not None:
         scene_data.change_weather(Path(weather).expanduser().resolve(), weather_zone)
     with _naming(checkpoint, changed):
-        state, scales = loaded.get("state_dict", {}), loaded[CHECKPOINT_KEY].get("scales", {})
-        per_frame = any(name.endswith("frame_ids") for name in state)
-        numbered = any(name.endswith("by_index") and bool(value) for name, value in state.items())
-        scene_data.scene = on_scales(scene_data.scene, scales, exactly=per_frame, numbered=numbered)
-        restore(module, scene_data, loaded)
-        if module.renderer.backend in ("cpu", "gsplat"):  # what the machine had on which it was trained
-            module.renderer.backend = "auto"
+        _adopt(module, scene_data, loaded)
         _try_render(module, scene_data.scene.train.frames[0])
     return Trained(config, module, scene_data, loaded)
+
+
+def _changed(of_training: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of the data that differ from training, as they are built with."""
+    changed = {key: None if value == "null" else value for key, value in given.items() if value is not None}
+    if "root" in changed:
+        changed["root"] = str(Path(changed["root"]).expanduser().resolve())
+    if changed.get("split", "list") != "list" and of_training.get("split_file"):
+        changed = {"split_file": None} | changed  # which belongs to the rule of training
+    if "weather" in changed and "weather" not in of_training:
+        raise SceneError(f"data.weather={changed['weather']}: the data set of this checkpoint has no weather to choose")
+    return changed
+
+
+def _adopt(module: SplatTraining, scene_data: Any, loaded: Mapping[str, Any]) -> None:
+    """Puts what a checkpoint holds into the module, and the scene on the scales of its run."""
+    state, scales = loaded.get("state_dict", {}), loaded[CHECKPOINT_KEY].get("scales", {})
+    per_frame = any(name.endswith("frame_ids") for name in state)
+    numbered = any(name.endswith("by_index") and bool(value) for name, value in state.items())
+    scene_data.scene = on_scales(scene_data.scene, scales, exactly=per_frame, numbered=numbered)
+    restore(module, scene_data, loaded)
+    if module.renderer.backend in ("cpu", "gsplat"):  # what the machine had on which it was trained
+        module.renderer.backend = "auto"
 
 
 def _names(trust: Sequence[str | type] | str | type) -> list[str]:

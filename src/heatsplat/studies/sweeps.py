@@ -133,6 +133,11 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
     if failed:
         lines += ["", f"Jobs without a result: {len(failed)}", "", *failed]
     scenes = ", ".join(sorted({row.scene for row in rows}))
+    return "\n".join([f"# Sweep on {scenes}", "", _about(rows), "", *lines, ""])
+
+
+def _about(rows: Sequence[Runs]) -> str:
+    """What all runs of a table share: settings, machines and versions; and whether its rows can be compared."""
     jobs = [set(settings_of(overrides)) for row in rows for overrides in row.table["overrides"]]
     shared = sorted(set.intersection(*jobs))
     about = "Mean ± standard deviation over seeds." + (f" {all_rows(shared)}" if shared else "")
@@ -141,8 +146,7 @@ def markdown(rows: Sequence[Runs], paper: Printed) -> str:
             " No two rows are of one scene, so their scores are not to be compared: a scene for all is data.scene=NAME."
         )
     results = [one for row in rows for one in row.table["results"].dropna()]
-    about = " ".join(filter(None, [about, clocks(map(ran_on, results)), versions(results)]))
-    return "\n".join([f"# Sweep on {scenes}", "", about, "", *lines, ""])
+    return " ".join(filter(None, [about, clocks(map(ran_on, results)), versions(results)]))
 
 
 def _cell(row: Runs, name: str, digits: int) -> str:

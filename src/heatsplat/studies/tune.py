@@ -344,6 +344,7 @@ def markdown(
     overrides: Sequence[str],
 ) -> str:
     """The report: what all runs have, the comparisons of all methods with their seeds, then every method's search."""
+    searches = {trial.method: [one for one in tried if one.method == trial.method] for trial in tried}
     runs = [trial.results for trial in tried if trial.results] + [one for each in checks for one in each.default]
     about = all_rows(overrides, threads=[one.run.get("threads") for one in runs])
     which = f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"
@@ -352,17 +353,16 @@ def markdown(
     head = ["method", "steps", "settings", "seeds", *columns, f"gain in {DEFINITIONS[score].heading}", "verdict"]
     rows = []
     for check in checks:
-        best = _best([trial for trial in tried if trial.method == check.method], score)
+        best = _best(searches[check.method], score)
         gain = over_seeds(check.gains, 3) if check.gains else ""
         rows.append([check.method, check.steps, "default", *_cells(check.default), "", ""])
         rows.append(["", "", ", ".join(_words(best.settings)), *_cells(check.best), gain, check.verdict])
     lines += markdown_table(head, rows, "lrlrrrrrrl")
-    for method in dict.fromkeys(trial.method for trial in tried):
-        own = [trial for trial in tried if trial.method == method]
+    for method, own in searches.items():
         if _best(own, score).settings == {}:
             lines += ["", f"{method}: no trial was better than the default, so there is nothing to compare."]
-    for method in dict.fromkeys(trial.method for trial in tried):
-        own, knobs = [trial for trial in tried if trial.method == method], list(cases[method]["knobs"])
+    for method, own in searches.items():
+        knobs = list(cases[method]["knobs"])
         lines += ["", f"## {method}: {' '.join(cases[method]['scene'])}, {steps} steps, seed 0", ""]
         lines += markdown_table(
             [*knobs, *columns],

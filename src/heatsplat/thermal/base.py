@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import METADATA, Camera, Course, SceneData, SceneError, check_option
+from heatsplat.geometry import spherical_harmonics
 from heatsplat.splats import GAUSSIANS, Splats
 
 NORMALS = "normals"  # the tensor that ``surface_normals`` declares
@@ -58,6 +59,17 @@ class Query:
         They point to the side from which the surface is seen. Images and not heat decide how it lies: no gradient passes.
         """
         return self.rows(splats[NORMALS].detach())
+
+    def sight(self, splats: Splats, what: str) -> Tensor:
+        """Unit vectors [n, 3] from the camera to the Gaussians. No gradient passes: what is seen must not pull at the geometry.
+
+        Raises:
+            ValueError: there is no camera, on which ``what`` depends.
+        """
+        if self.camera is None:
+            raise ValueError(f"{what} depends on the view: give a camera")
+        means = self.rows(splats.means).detach()
+        return spherical_harmonics.unit(means - self.camera.center.to(means))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import SceneData, check_count
-from heatsplat.geometry import spherical_harmonics
 from heatsplat.same_bits import everywhere, sigmoid
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, surface_normals
@@ -68,10 +67,7 @@ class DirectionalEmissivity(HeatPart):
 
     def mirrored(self, splats: Splats, query: Query) -> Tensor:
         """s (1 - cos θ)^p, [n, 1]."""
-        if query.camera is None:
-            raise ValueError("how much a surface emits depends on the view: give a camera")
-        means = query.rows(splats.means).detach()  # the angle must not pull at the geometry
-        sight = spherical_harmonics.unit(means - query.camera.center.to(means))
+        sight = query.sight(splats, "how much a surface emits")
         normals = query.normals(splats)
         if self.lr_tilt > 0:
             normals = normals + query.rows(splats["normal_tilt"])

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneData, SceneError, Weather, check_option
-from heatsplat.geometry import spherical_harmonics
 from heatsplat.geometry.rotations import reflected
 from heatsplat.physics import sky
 from heatsplat.physics.units import kelvin
@@ -67,8 +66,6 @@ class MirroredSky(HeatPart):
         return {"sky_reflectance_logit": PerGaussian(start, self.lr_reflectance)} | surface_normals(seeds)
 
     def forward(self, values: Tensor, splats: Splats, query: Query) -> Tensor:
-        if query.camera is None:
-            raise ValueError("what a surface mirrors depends on the view: give a camera")
         own = self.range.kelvin(values) / 100.0  # of which powers are of order 100
         share = sigmoid(query.rows(splats["sky_reflectance_logit"]))[:, None]
         mirrored = (1 - share) * own.square().square() + share * self._radiance(splats, query)[:, None]
@@ -77,10 +74,7 @@ class MirroredSky(HeatPart):
 
     def _radiance(self, splats: Splats, query: Query) -> Tensor:
         """L of what the Gaussians in ``query.ids`` mirror, [n], as T⁴ in units of (100 K)⁴."""
-        means = query.rows(splats.means).detach()  # a mirror image must not pull at the geometry
-        normals = query.normals(splats)
-        sight = spherical_harmonics.unit(means - query.camera.center.to(means))
-        mirrored = reflected(sight, normals)
+        mirrored = reflected(query.sight(splats, "what a surface mirrors"), query.normals(splats))
         sine = mirrored @ self._weather.up.to(mirrored)
         air_k, depth = self._air(query.time_s)
         emissivity = sky.emissivity_towards(depth, sine)

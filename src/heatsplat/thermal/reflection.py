@@ -71,12 +71,7 @@ class Reflection(HeatPart):
         """L where Gaussians with these values [n, 1] mirror it, [n, 1]."""
         if self.degree == 0:
             return everywhere(spherical_harmonics.C0 * self.surroundings, values)
-        if query.camera is None:
-            raise ValueError("what a surface mirrors depends on the view: give a camera")
-        means = query.rows(splats.means).detach()  # a mirror image must not pull at the geometry
-        normals = query.normals(splats)
-        sight = spherical_harmonics.unit(means - query.camera.center.to(means))
-        mirrored = reflected(sight, normals)
+        mirrored = reflected(query.sight(splats, "what a surface mirrors"), query.normals(splats))
         return (spherical_harmonics.basis(mirrored, self.degree) @ self.surroundings)[:, None]
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:

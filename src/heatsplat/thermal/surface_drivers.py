@@ -12,12 +12,12 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneError, Weather
 from heatsplat.geometry.exposure import felt_directions
+from heatsplat.physics.drivers import of_sky, of_sunlight, of_water
 from heatsplat.physics.responses import driver_means
 from heatsplat.physics.sky import law_for, sky_temperature_k
-from heatsplat.physics.surfaces import Drivers, power_excess
+from heatsplat.physics.surfaces import Drivers
 from heatsplat.physics.units import celsius, kelvin
 from heatsplat.physics.walls import LEAST_K
-from heatsplat.physics.wetness import drying_mm_s_k, vapour_k
 from heatsplat.thermal.balance_options import BalanceOptions
 from heatsplat.thermal.weather_drive import NO_CLOUDS
 
@@ -112,15 +112,10 @@ def _sunlight(weather: Weather, options: BalanceOptions) -> Contribution:
     """Beams with the direction that is up where surfaces meet them as they lie, and the light of all but the beams."""
     if not options.sun:
         return Contribution()
-    directed = None not in (weather.sun, weather.direct_w_m2, weather.diffuse_w_m2)
-    if directed and options.normals == "seen":
-        drivers = {
-            "up": weather.up.to(torch.float64),
-            "light": weather.diffuse_w_m2 / 1000.0,
-            "beams": weather.direct_w_m2[:, None] * weather.sun / 1000.0,
-        }
+    drivers = of_sunlight(weather, tilted=options.normals == "seen")
+    if "beams" in drivers:
         return Contribution(drivers, {"solar": {"surfaces": "as seen", "sky": "isotropic"}})
-    if weather.irradiance_w_m2 is None:
+    if not drivers:
         log.warning("the weather has no irradiance: nothing is heated by the sun")
         return Contribution(
             effects={"convection": {"left_out_sun": "sunlight, of which the weather has no irradiance"}}
@@ -128,7 +123,7 @@ def _sunlight(weather: Weather, options: BalanceOptions) -> Contribution:
     solar = {"surfaces": "level"}
     if options.normals == "seen":
         solar["left_out"] = "the direction of the sun, which the weather lacks"
-    return Contribution({"light": weather.irradiance_w_m2 / 1000.0}, {"solar": solar})
+    return Contribution(drivers, {"solar": solar})
 
 
 def _surroundings(
@@ -174,17 +169,13 @@ def _sky(weather: Weather, options: BalanceOptions, reference_k: float, up: Tens
     clouds = weather.clouds if options.clouds else 0.0
     if clouds is None:
         raise SceneError(f"the weather {NO_CLOUDS}")
-    air_k = kelvin(weather.air_c)
-    sky_k = sky_temperature_k(air_k, weather.humidity_percent, law, clouds)
-    drivers = {"sky": power_excess(sky_k - reference_k, reference_k)}
-    if up is not None:
-        drivers["around"] = power_excess(air_k - reference_k, reference_k)
+    sky_k = sky_temperature_k(kelvin(weather.air_c), weather.humidity_percent, law, clouds)
     radiation = {"sky": law, "power": "about each mean" if options.linear else "T⁴"}
     if options.clouds:
         radiation["clouds"] = weather.notes.get("clouds", "recorded")
     if not humid:
         radiation["left_out"] = "humidity, which the weather lacks"
-    return Contribution(drivers, {"radiation": radiation})
+    return Contribution(of_sky(weather, sky_k, reference_k, tilted=up is not None), {"radiation": radiation})
 
 
 def _wind(weather: Weather, options: BalanceOptions, mean_wind: float) -> Contribution:
@@ -220,9 +211,9 @@ def _water(weather: Weather, options: BalanceOptions) -> Contribution:
 
     Another weather, such as a forecast, often has no column of rain.
     """
-    drivers: dict[str, Any] = {}
     effects: dict[str, Any] = {}
     humid = weather.humidity_percent is not None
+    holds_mm = None  # where no rain wets surfaces
     if options.transpires:
         if not humid:
             raise SceneError(
@@ -233,11 +224,8 @@ def _water(weather: Weather, options: BalanceOptions) -> Contribution:
         log.warning("the weather has no rain_mm_h with humidity_percent: surfaces stay dry")
         effects["left_out_rain"] = "rain, of which the weather has no rain_mm_h, or no humidity_percent"
     elif options.rain is not None:
-        times_s, rain = weather.times_s, weather.rain_mm_h / 3600.0
-        fallen = float(driver_means(times_s, rain)) * float(times_s[-1] - times_s[0])
+        times_s = weather.times_s
+        fallen = float(driver_means(times_s, weather.rain_mm_h / 3600.0)) * float(times_s[-1] - times_s[0])
         effects["rain"] = f"{fallen:.3g} mm, of which surfaces hold up to {options.rain:g}"
-        if fallen > 0:
-            drivers |= {"rain": rain, "dries": drying_mm_s_k(weather), "holds_mm": options.rain}
-    if drivers or options.transpires:
-        drivers["vapour"] = vapour_k(kelvin(weather.air_c), weather.humidity_percent)
-    return Contribution(drivers, {"convection": effects} if effects else {})
+        holds_mm = options.rain if fallen > 0 else None
+    return Contribution(of_water(weather, holds_mm, options.transpires), {"convection": effects} if effects else {})

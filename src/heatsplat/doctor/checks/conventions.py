@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.contracts import Camera, evenly_spread
-from heatsplat.doctor.base import Check, Finding, Material, shrunk
+from heatsplat.doctor.base import Check, Finding, Material, coarse
 from heatsplat.effects.observations import in_view
 from heatsplat.geometry.transforms import OPENGL_AXES
 
@@ -157,8 +157,7 @@ def _small(material: Material, frame: int) -> Tensor:
     """A frame [h, w] with SIDE pixels along its shorter side; its mean where nothing is known."""
     image, counts = material.image(frame), material.counts(frame)
     image = torch.where(counts, image, image[counts].mean() if counts.any() else 0.0)
-    scale = max(1.0, min(image.shape) / SIDE)
-    return shrunk(image, (round(image.shape[0] / scale), round(image.shape[1] / scale)))
+    return coarse(image, SIDE)
 
 
 def _fit(one: Tensor, other: Tensor, lens: Tensor, other_lens: Tensor, view: Tensor, other_view: Tensor) -> float:

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from heatsplat.doctor.base import MIN_FRAMES, Check, Finding, Material, coarse, unit
+from heatsplat.doctor.base import MIN_FRAMES, Check, Finding, Material, coarse
+from heatsplat.effects.observations import standardised
 
 BETTER = 0.03  # correlation by which another frame has to fit better than a frame's own
 NEARLY_ALL = 0.7
@@ -33,7 +34,7 @@ def find(material: Material) -> list[Finding]:
     heat, light = heat[shows], light[shows]
     if len(heat) < MIN_FRAMES:
         return found
-    fits = torch.einsum("fp,gp->fg", unit(heat.flatten(1)), unit(light.flatten(1)))
+    fits = torch.einsum("fp,gp->fg", standardised(heat.flatten(1)), standardised(light.flatten(1)))
     count = len(fits)
     own = fits.diagonal()
     best = float(fits.max(1).values.median())

@@ -7,7 +7,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from heatsplat.contracts import Camera, evenly_spread
-from heatsplat.doctor.base import Check, Finding, Material, some, unit
+from heatsplat.doctor.base import Check, Finding, Material, some
+from heatsplat.effects.observations import standardised
 from heatsplat.geometry.projection import to_world
 
 PAIRS, POINTS, CANDIDATES = 10, 100, 1500
@@ -101,7 +102,7 @@ def _shifts(material: Material, one: int, other: int, points: Tensor) -> tuple[f
     base = second.project(to_world(rays, camera.viewmat).reshape(-1, 3))[0].reshape(len(keep), -1, 2)
     steps = torch.arange(-REACH, REACH + 1, dtype=torch.float64)
     moves = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), -1).reshape(-1, 2)
-    best, where = _alike(unit(first), material.image(other), base, moves).max(1)
+    best, where = _alike(standardised(first), material.image(other), base, moves).max(1)
     found = best > ALIKE
     shift = torch.where(found, moves[where].norm(dim=1), float(REACH + 1))
     return float(shift.quantile(1.0 - SHARE)), float((shift <= FAR_PX).double().mean())

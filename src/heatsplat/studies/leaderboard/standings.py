@@ -170,15 +170,7 @@ def standings(folder: Path, board: Board) -> Standings:
     places = {(run.method, run.scene, run.track): run for run in _entries(board)}
     for path in sorted(folder.glob(f"*/{OVERRIDES}")):
         _add_run(places, path.parents[1], board)
-    for submission in sorted(board.submissions, key=lambda one: one.seed is None):  # others take what numbers are left
-        for scene, score in ((scene, submission.scores[scene]) for scene in board.scenes if scene in submission.scores):
-            key = (submission.method, scene, submission.track)
-            entry = places.setdefault(key, Entry(*key))
-            taken = entry.all_numbers
-            seed = next(n for n in count() if n not in taken) if submission.seed is None else submission.seed
-            if seed not in taken:
-                told = (score, score.cost, submission.folder, submission.command, submission.machine)
-                entry.runs.append(Result(seed, *told, handed_in=True))
+    _add_submissions(places, board)
     note = ""
     if board.earlier is not None:
         for place, seeds in board.earlier.seeds.items():
@@ -186,16 +178,12 @@ def standings(folder: Path, board: Board) -> Standings:
                 places.setdefault(place, Entry(*place))
         note = sentence(add_earlier(places, board.earlier))
     entries = list(places.values())
-    machines = Counter(run.on for entry in entries for run in entry.runs if run.on)
-    if machines:
-        told = "; ".join(f"{machine} ({counted(runs, 'run')})" for machine, runs in sorted(machines.items()))
-        note = " ".join(filter(None, [note, f"Measured on {told}."]))
     for ranked, usual in _competitions(entries, board):
         means = [one.mean(board.score) for one in ranked]
         errors = [standard_error(one, board.score, usual) for one in ranked]
         for entry, rank in zip(ranked, ranks(means, errors, board.higher), strict=True):
             entry.rank = rank
-    return Standings(entries, note)
+    return Standings(entries, " ".join(filter(None, [note, _measured_on(entries)])))
 
 
 def _competitions(entries: Sequence[Entry], board: Board) -> Iterator[tuple[list[Entry], float | None]]:
@@ -215,6 +203,28 @@ def _entries(board: Board) -> list[Entry]:
         for scene in board.scenes
         for method in board.methods
     ]
+
+
+def _add_submissions(places: dict[Place, Entry], board: Board) -> None:
+    """Adds what was handed in; what has no seed takes the first number that is left, and a seed that is there is not replaced."""
+    for submission in sorted(board.submissions, key=lambda one: one.seed is None):
+        for scene in board.scenes:
+            if scene not in submission.scores:
+                continue
+            key, score = (submission.method, scene, submission.track), submission.scores[scene]
+            entry = places.setdefault(key, Entry(*key))
+            taken = entry.all_numbers
+            seed = next(n for n in count() if n not in taken) if submission.seed is None else submission.seed
+            if seed not in taken:
+                told = (score, score.cost, submission.folder, submission.command, submission.machine)
+                entry.runs.append(Result(seed, *told, handed_in=True))
+
+
+def _measured_on(entries: Sequence[Entry]) -> str:
+    """A sentence on the machines that seconds are of; empty where none is known."""
+    machines = Counter(run.on for entry in entries for run in entry.runs if run.on)
+    told = "; ".join(f"{machine} ({counted(runs, 'run')})" for machine, runs in sorted(machines.items()))
+    return f"Measured on {told}." if told else ""
 
 
 def _add_run(places: Mapping[Place, Entry], folder: Path, board: Board) -> None:

@@ -174,7 +174,7 @@ def _fill(
     """Puts ours into a line: the mean over scenes of the means over seeds."""
     runs = [row for scene in have if (row := _of(results, line.method, line.setting, scene))]
     line.have, line.seeds = have, min((row.count for row in runs), default=0)
-    for metric in dict.fromkeys(figure.metric for figure in reproduction.figures):
+    for metric in reproduction.printed_metrics:
         ours = reproduction.ours(metric)
         values = [row.mean(ours) for row in runs] if ours else []
         if values and None not in values:
@@ -190,7 +190,7 @@ def _fill(
 def _reasons(runs: Sequence[RunResults], reproduction: Reproduction) -> list[str]:
     """Why printed metrics have no value of ours, a line each."""
     lines = []
-    for metric in dict.fromkeys(figure.metric for figure in reproduction.figures):
+    for metric in reproduction.printed_metrics:
         ours, known = reproduction.ours(metric), METRICS[metric]
         if ours is None:
             lines.append(f"{known.title}: {known.why_not}")
@@ -205,9 +205,31 @@ def markdown(
     reproduction: Reproduction, lines: Sequence[Line], reasons: Sequence[str] = (), failed: Sequence[str] = ()
 ) -> str:
     """The comparison for people. A cell reads ours / paper's (ours less paper's)."""
-    metrics = list(dict.fromkeys(figure.metric for figure in reproduction.figures))
-    costs = [name for name in BESIDE if name not in {reproduction.ours(metric) for metric in metrics}]
-    costs = [name for name in costs if any(name in line.cost for line in lines)]
+    text = [
+        f"# {reproduction.title}: ours beside the paper's",
+        "",
+        "A cell reads: ours / printed (ours less printed). – is none. Ours is a mean over seeds (± standard deviation where "
+        "there are several), then over scenes. Seconds, memory and frames/s are of other machines than the paper's.",
+        "",
+        *_table(reproduction, lines),
+    ]
+    for title, items in (
+        ("Without ours", [*reproduction.left_out(), *reasons]),
+        ("Not on disk", [", ".join(reproduction.missing)] if reproduction.missing else []),
+        ("Jobs without a result", failed),
+        ("Notes", _notes(reproduction)),
+        ("How cells were read", list(dict.fromkeys(figure.note for figure in reproduction.figures if figure.note))),
+    ):
+        if items:
+            text += ["", f"## {title}", "", *(f"- {item}" for item in items)]
+    return "\n".join([*text, ""])
+
+
+def _table(reproduction: Reproduction, lines: Sequence[Line]) -> list[str]:
+    """Lines of the table: what the paper prints beside ours, then what ours cost, where the paper does not print that."""
+    metrics = reproduction.printed_metrics
+    compared = {reproduction.ours(metric) for metric in metrics}
+    costs = [name for name in BESIDE if name not in compared and any(name in line.cost for line in lines)]
     several = any(setting for _, setting in reproduction.rows)
     head = ["scene", "method", *(["setting"] if several else []), *(METRICS[metric].title for metric in metrics)]
     head += [f"ours: {COSTS[name].heading}" for name in costs]
@@ -217,29 +239,19 @@ def markdown(
         cells = [line.label, method, *([line.setting or NONE] if several else [])]
         cells += [_cell(line, metric) for metric in metrics]
         rows.append(cells + [number(line.cost.get(name), COSTS[name].digits) for name in costs])
-    text = [
-        f"# {reproduction.title}: ours beside the paper's",
-        "",
-        "A cell reads: ours / printed (ours less printed). – is none. Ours is a mean over seeds (± standard deviation where "
-        "there are several), then over scenes. Seconds, memory and frames/s are of other machines than the paper's.",
-        "",
-        *markdown_table(head, rows),
-    ]
-    wanted = {metric: reproduction.metrics[metric] for metric in metrics if metric in reproduction.metrics}
-    notes = [f"{METRICS[metric].title} of ours is `{name}` (docs/conventions.md)." for metric, name in wanted.items()]
-    if reproduction.source and reproduction.source.unsure:
-        notes.append(reproduction.source.unsure)
-    shown = dict.fromkeys(figure.note for figure in reproduction.figures if figure.note)
-    for title, items in (
-        ("Without ours", [*reproduction.left_out(), *reasons]),
-        ("Not on disk", [", ".join(reproduction.missing)] if reproduction.missing else []),
-        ("Jobs without a result", failed),
-        ("Notes", [*notes, *reproduction.notes]),
-        ("How cells were read", list(shown)),
-    ):
-        if items:
-            text += ["", f"## {title}", "", *(f"- {item}" for item in items)]
-    return "\n".join([*text, ""])
+    return markdown_table(head, rows)
+
+
+def _notes(reproduction: Reproduction) -> list[str]:
+    """Which of our scores stand for printed metrics, and what is doubtful about data set and table."""
+    ours = {
+        metric: reproduction.metrics[metric]
+        for metric in reproduction.printed_metrics
+        if metric in reproduction.metrics
+    }
+    notes = [f"{METRICS[metric].title} of ours is `{name}` (docs/conventions.md)." for metric, name in ours.items()]
+    unsure = [reproduction.source.unsure] if reproduction.source and reproduction.source.unsure else []
+    return [*notes, *unsure, *reproduction.notes]
 
 
 def _cell(line: Line, metric: str) -> str:

@@ -104,6 +104,11 @@ class Reproduction:
         """Such as "ETGS, Tab. 1"."""
         return f"{TITLES[self.paper]}, " + ("running text" if self.table == "text" else f"Tab. {self.table}")
 
+    @property
+    def printed_metrics(self) -> list[str]:
+        """Metrics of which the table prints figures, in its order."""
+        return list(dict.fromkeys(figure.metric for figure in self.figures))
+
     def ours(self, metric: str) -> str | None:
         """Score or cost in metrics.json that a printed metric is compared with."""
         return self.metrics.get(metric, METRICS[metric].ours)
@@ -140,8 +145,7 @@ class Reproduction:
                 f"  Before them, {len(firsts)} runs: {', '.join(f'{row} on {where}' for row, where in firsts)}"
             )
         lines += [f"  {text}" for text in self.left_out()]
-        printed = {figure.metric for figure in self.figures}
-        if (self.runs or self.missing) and printed & {"lpips", "rgb_lpips"}:
+        if (self.runs or self.missing) and {"lpips", "rgb_lpips"} & set(self.printed_metrics):
             try:
                 find_backbone(str(lpips_net), lpips_weights)
             except LpipsUnavailable as error:
@@ -209,23 +213,7 @@ def reproduction_of(
     wanted = _wanted(config, data, printed) if data and recipes else []
     folder = Path(root).expanduser() if root else None
     found = data.find(folder, config["folders"]) if data else {}
-    here = [scene for scene in wanted if scene in found]
-    runs: list[Run] = []
-    waiting: list[str] = []
-    for (method, setting), recipe in recipes.items():
-        others = config["others"].get(f"{method} {setting}")
-        for scene in here:
-            run = Run(method, setting, scene, found[scene], (*recipe, f"data.scene='{found[scene]}'"))
-            if others is None:
-                runs.append(run)
-            elif lost := [key for key in data.scenes if key != scene and key not in found]:
-                waiting.append(
-                    f"Not run: {row_name(method, setting)} on {scene}, which comes after a run on all the other scenes; "
-                    f"{', '.join(lost)} is not on disk"
-                )
-            else:
-                folders = [found[key] for key in data.scenes if key != scene]
-                runs.append(replace(run, after=_on_others(run, folders, (*recipe, *others))))
+    runs, waiting = _runs(config, recipes, data, found, wanted)
     return Reproduction(
         paper=paper,
         table=table,
@@ -242,6 +230,34 @@ def reproduction_of(
         notes=(*config["notes"], *doubts(paper, table)),
         folders=config["folders"] or {},
     )
+
+
+def _runs(
+    config: Mapping[str, Any],
+    recipes: Mapping[tuple[str, str], Sequence[str]],
+    data: Source | None,
+    found: Mapping[str, str],
+    wanted: Sequence[str],
+) -> tuple[list[Run], list[str]]:
+    """A run of every recipe on every wanted scene that is found, and a line on each that would come after a run on all other
+    scenes, of which some are not."""
+    runs: list[Run] = []
+    waiting: list[str] = []
+    for (method, setting), recipe in recipes.items():
+        others = config["others"].get(f"{method} {setting}")
+        for scene in (scene for scene in wanted if scene in found):
+            run = Run(method, setting, scene, found[scene], (*recipe, f"data.scene='{found[scene]}'"))
+            if others is None:
+                runs.append(run)
+            elif lost := [key for key in data.scenes if key != scene and key not in found]:
+                waiting.append(
+                    f"Not run: {row_name(method, setting)} on {scene}, which comes after a run on all the other scenes; "
+                    f"{', '.join(lost)} is not on disk"
+                )
+            else:
+                folders = [found[key] for key in data.scenes if key != scene]
+                runs.append(replace(run, after=_on_others(run, folders, (*recipe, *others))))
+    return runs, waiting
 
 
 def _on_others(run: Run, folders: Sequence[str], overrides: tuple[str, ...]) -> OnOthers:
