@@ -206,8 +206,8 @@ def _doubts(found: Triangulated) -> list[str]:
         return [
             said
             + "Are the camera's axes those of the format (of a transforms.json x right, y up, z backwards, and poses from "
-            "camera to world), are its images those of these names, and its focal length that of this size? poses=thermal "
-            "finds cameras anew"
+            "camera to world), are its images those of these names, and its focal length that of this size? Poses of "
+            "GPS and gimbal alone are that far off, too. poses=thermal finds cameras anew"
         ]
     return [
         said + "Training with cameras=refined corrects cameras that are a few pixels off; poses=thermal finds them anew"
