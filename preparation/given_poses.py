@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, check_option, counted
 from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats.aligned_cameras import AlignedCameras
 from heatsplat.datamodules.formats.colmap import find_model, is_model, read_model_of, write_model
@@ -22,13 +22,18 @@ from heatsplat.datamodules.formats.pix4d import is_pix4d, read_pix4d
 from heatsplat.datamodules.nerfstudio import find_transforms
 from heatsplat.datamodules.points import ply_points
 from heatsplat.preparation.cameras_picture import draw_cameras
+from heatsplat.preparation.features import Features, Sift
 from heatsplat.preparation.frame import ThermalFrame
-from heatsplat.preparation.poses import PICTURE, put_whole
+from heatsplat.preparation.poses import PICTURE, FindPoses, put_whole, write_whole
 from heatsplat.preparation.report import Section
 from heatsplat.preparation.target import WORK
+from heatsplat.preparation.triangulation import MATCHES, NEAR_PX, Triangulated, stored, triangulated
 from heatsplat.preparation.writer import EAST_NORTH_UP, image_name, write_places, write_world
 
 OTHER_SHAPE = 0.01  # by which width over height of a camera and of its frame may differ
+FEW_POINTS = 100  # below which points are taken for none (ours)
+# Median distance of matches above which cameras are off, in pixels: exact ones have 0.5 at 160x128, those a pixel off 1.2 (ours).
+OFF_PX = 1.5
 
 
 @dataclass(frozen=True)
@@ -37,14 +42,30 @@ class GivenPoses:
 
     Poses, lenses and points are written as they are into sparse/0, under the names of the prepared images. Scale and
     orientation of the world stay the tool's own, unless it knows where on the earth it is: axes are then east, north and up
-    in metres, and the places in frames.csv are those of the cameras.
+    in metres, and the places in frames.csv are those of the cameras. Points that are lacking are triangulated.
 
     Args:
         model: folder with sparse/0 (or cameras.bin itself), with transforms.json, with a cameras.xml of Metashape or with
             *_calibrated_camera_parameters.txt of Pix4D, or one of the last two files; names are those of the camera's files.
+        triangulate: "auto": points are triangulated from the frames where the cameras come with fewer than ``FEW_POINTS``;
+            True: in place of points that come with them, too; False: never.
+        features: what finds and matches features.
+        video, all_pairs, overlap, clip, seed: of the search for cameras (``FindPoses``); neighbours in space are those of the
+            given cameras.
     """
 
     model: str
+    triangulate: str | bool = "auto"
+    features: Features = Sift()
+    video: bool | None = None
+    all_pairs: int = 120
+    overlap: int = 10
+    clip: float = 3.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_option("poses.triangulate", self.triangulate, ("auto", True, False), SceneError)
+        self._matching()
 
     def __call__(self, frames: list[ThermalFrame], target: Path) -> Section:
         """Writes ``target``/sparse/0. Returns which frames have a camera and which have none.
@@ -54,40 +75,143 @@ class GivenPoses:
         """
         model = model_in(Path(self.model).expanduser(), frames)
         camera_of, why = matched(frames, model)
-        viewmats, lenses = {}, {}
+        viewmats, lenses, posed = {}, {}, []
         for frame in frames:
             if frame.name in camera_of:
                 viewmat, lens = model.cameras[camera_of[frame.name]]
                 _check_shape(frame, lens, model.source)
-                viewmats[image_name(frame)] = viewmat
-                lenses[image_name(frame)] = _stored(lens)
-        kinds = list(dict.fromkeys(lenses.values()))
-        numbers = {name: kinds.index(kind) for name, kind in lenses.items()}
-        colors = (255.0 * model.colors).round().astype(np.uint8)
-        fresh = target / WORK / "sparse"
-        write_model(fresh, viewmats, kinds, model.points, colors, camera_of=numbers)
-        put_whole(fresh, target / "sparse" / "0")
+                viewmats[image_name(frame)], lenses[image_name(frame)] = viewmat, lens
+                posed.append(frame)
+        few = len(model.points) < FEW_POINTS
+        found, why_not = None, "poses.triangulate=false"
+        if self.triangulate is True or self.triangulate == "auto" and few:
+            try:
+                found = triangulated(self._matching(), posed, target, viewmats, lenses)
+            except SceneError as error:
+                why_not = str(error)
+        points, folder, fresh = model.points, target / "sparse" / "0", target / WORK / "sparse"
+        if taken := found is not None and len(found.error_px) >= FEW_POINTS and not found.disagrees:
+            points = np.array([point.xyz for point in found.model.points3D.values()])
+            write_whole(found.model, folder, target / WORK)
+        else:
+            stores = {name: stored(lens) for name, lens in lenses.items()}
+            kinds = list(dict.fromkeys(stores.values()))
+            numbers = {name: kinds.index(kind) for name, kind in stores.items()}
+            colors = (255.0 * model.colors).round().astype(np.uint8)
+            write_model(fresh, viewmats, kinds, points, colors, camera_of=numbers)
+            put_whole(fresh, folder)
         write_world(target, model.metres_per_unit, EAST_NORTH_UP if model.east_north_up else None)
         if model.origin is not None:
             centers = np.stack([np.linalg.inv(viewmat)[:3, 3] for viewmat in viewmats.values()])
             write_places(target, dict(zip(viewmats, latitude_longitude(centers, model.origin), strict=True)))
         lines = [
             f"{len(viewmats)} of {len(frames)} frames have a camera in {model.source}, which is taken as it is; "
-            f"{len(model.points)} points."
+            f"{counted(len(points), 'point')}."
         ]
         lines += model.notes or ["Scale and orientation are those of the tool that made it."]
-        if not len(model.points):
-            lines.append("It has no points: training starts from random ones, and nothing can be checked by points.")
+        findings = [] if found is None else _doubts(found)
+        if self.triangulate is True or few:
+            lines += (said := _of_points(len(model.points), found, taken, why_not))
+            if few and self.triangulate is not False and not taken and not findings:
+                findings.append(said[0])
         if unused := len(model.cameras) - len(set(camera_of.values())):
             lines.append(f"{unused} of its cameras belong to no frame of this recording.")
-        if len(model.points) > 2:
-            draw_cameras(target / PICTURE, list(viewmats.values()), model.points, model.east_north_up)
+        if len(points) > 2:
+            draw_cameras(target / PICTURE, list(viewmats.values()), points, model.east_north_up)
             lines += ["", f"![cameras over the points]({PICTURE})", ""]
         missing = {f.name: why.get(f.name, "the model has no camera for it") for f in frames if f.name not in camera_of}
         lines += [f"- {name}: {reason}" for name, reason in missing.items()]
-        values = {"registered": len(viewmats), "frames": len(frames), "points": len(model.points)}
+        values = {"registered": len(viewmats), "frames": len(frames), "points": len(points)}
         values |= {"not_registered": missing, "metres_per_unit": model.metres_per_unit}
-        return Section("Poses", lines, values)
+        values |= {} if found is None else _figures(found)
+        return Section("Poses", lines, values, findings)
+
+    def _matching(self) -> FindPoses:
+        """How features are found and matched. Raises SceneError for settings that cannot be."""
+        return FindPoses(
+            self.features,
+            video=self.video,
+            all_pairs=self.all_pairs,
+            overlap=self.overlap,
+            gps=False,
+            clip=self.clip,
+            seed=self.seed,
+        )
+
+
+def _figures(found: Triangulated) -> dict[str, object]:
+    """What a program may want to read of triangulated points, as plain JSON values; None where there is none."""
+    return {
+        "triangulated": len(found.error_px),
+        "features": int(np.median(found.features)),
+        "matches": len(found.away_px),
+        "matches_away_px": _median(found.away_px),
+        "matches_near": round(float((found.away_px <= NEAR_PX).mean()), 4) if len(found.away_px) else None,
+        "reprojection_error_px": _median(found.error_px),
+        "angle_deg": _median(found.angle_deg),
+    }
+
+
+def _median(values: np.ndarray) -> float | None:
+    """The lower median, rounded; None of none, and where it is infinite."""
+    middle = float(np.quantile(values, 0.5, method="lower")) if len(values) else np.inf
+    return round(middle, 4) if np.isfinite(middle) else None
+
+
+def _of_points(given: int, found: Triangulated | None, taken: bool, why_not: str) -> list[str]:
+    """Where points come from, what their lack means, and how well features and cameras agree."""
+    has = "The cameras come without points" if not given else f"The cameras come with {counted(given, 'point')}"
+    random = "training starts from random ones, and nothing can be checked by points"
+    stay = random if not given else "these stay"
+    if found is None:
+        return [f"{has}, and none were triangulated ({why_not}): {stay}."]
+    seen = f"{counted(len(found.away_px), 'matched pair')} of features ({np.median(found.features):.0f} in an image, median)"
+    lines = []
+    if taken:
+        lines.append(
+            f"{has}{'' if not given else ', which were replaced'}: {counted(len(found.error_px), 'point')} were triangulated "
+            f"from {seen}, with them held; reprojection error {_median(found.error_px):.2f} px, rays meet under "
+            f"{_median(found.angle_deg):.1f}° (medians)."
+        )
+    elif found.disagrees:
+        lines.append(f"{has}, and points that such cameras see would be wrong: {stay}.")
+    else:
+        lines.append(
+            f"{has}, and only {len(found.error_px)} could be triangulated from {seen}, where {FEW_POINTS} are needed: {stay}. "
+            "More overlap between frames helps, or the tool's own points: in a COLMAP model, or as ply_file_path of a "
+            "transforms.json."
+        )
+    if len(found.away_px) >= MATCHES:
+        lines.append(
+            f"Matched features lie {_pixels(found)} (median) from where the given cameras see each other's; "
+            f"{100.0 * (found.away_px <= NEAR_PX).mean():.0f} % lie within {NEAR_PX:.0f} px."
+        )
+    return lines
+
+
+def _pixels(found: Triangulated) -> str:
+    """How far matches lie away, in words."""
+    middle = _median(found.away_px)
+    return "behind a camera" if middle is None else f"{middle:.2g} px"
+
+
+def _doubts(found: Triangulated) -> list[str]:
+    """What is wrong with the given cameras, by the matches of the images."""
+    middle = _median(found.away_px)
+    if len(found.away_px) < MATCHES or middle is not None and middle <= OFF_PX:
+        return []
+    said = f"The given cameras and the images {'do not agree' if found.disagrees else 'agree poorly'}: matched features lie "
+    said += f"{_pixels(found)} (median) from where the cameras see each other's, and below 1 px where both belong together. "
+    if found.disagrees:
+        return [
+            said
+            + "Are the camera's axes those of the format (of a transforms.json x right, y up, z backwards, and poses from "
+            "camera to world), are its images those of these names, and its focal length that of this size? Poses of "
+            "GPS and gimbal alone are that far off, too. poses=thermal finds cameras anew"
+        ]
+    return [
+        said + "Training with cameras=refined corrects cameras that are a few pixels off; poses=thermal finds them anew"
+    ]
 
 
 def model_in(folder: Path, frames: Sequence[ThermalFrame]) -> AlignedCameras:
@@ -215,14 +339,3 @@ def _check_shape(frame: ThermalFrame, lens: Lens, source: Path) -> None:
             f"{source}: the camera of {frame.path.name} is one of {lens.width}x{lens.height} pixels, the frame has {width}x"
             f"{height}; give the model of the images as the camera wrote them, not of cropped or undistorted ones"
         )
-
-
-def _stored(lens: Lens) -> tuple[str, tuple[float, ...], int, int]:
-    """A lens as COLMAP's camera: model, parameters, width, height."""
-    matrix = (lens.fx, lens.fy, lens.cx, lens.cy)
-    if lens.fisheye:
-        return "OPENCV_FISHEYE", (*matrix, *lens.distortion), lens.width, lens.height
-    if lens.is_distorted:
-        full = (*lens.distortion, *[0.0] * (8 - len(lens.distortion)))
-        return "FULL_OPENCV", (*matrix, *full), lens.width, lens.height
-    return "PINHOLE", matrix, lens.width, lens.height

@@ -183,9 +183,9 @@ class Search:
                     image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)
                 }
         todo = [name for name in names if name in missing]
-        cameras: dict[Any, int] = {}  # by device and shape: asked of the database, which lists all of its images
+        cameras: dict[Any, int] = {}  # by lens and shape: asked of the database, which lists all of its images
         for name in _progress(todo, f"finding features in {counted(len(todo), 'image')}"):
-            kind = self._device(name), _shape(self.work / "images" / name)
+            kind = self._lens_of(name), _shape(self.work / "images" / name)
             if cameras.get(kind, -1) < 0:
                 cameras[kind] = self._camera_of(*kind)
             reader.existing_camera_id = cameras[kind]
@@ -378,6 +378,10 @@ class Search:
     def _device(self, copy: str) -> int | None:
         """Which of the thermal cameras took a copy; None for photos."""
         return self.device_of[self.frames[self.name_of[copy]].name] if copy in self.name_of else None
+
+    def _lens_of(self, copy: str) -> int | None:
+        """What copies of one camera in the database have in common, beside their shape."""
+        return self._device(copy)
 
     def _camera_of(self, device: int | None, shape: tuple[int, int]) -> int:
         """Number in the database of the camera that took the copies of a device (of photos for None) of one height and width; -1

@@ -151,6 +151,8 @@ def _cameras(
     finally:
         place.has_cameras()
     log.info("%s", found.lines[0])
+    for finding in found.findings:
+        log.warning("%s", finding)
     sections = [found, replace(doctor(), title="Doctor, with the cameras")] if doctor else [found]
     log.info("it trains: python src/train.py data=colmap %s", typed(setting("data.root", target)))
     return sections

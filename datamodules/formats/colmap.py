@@ -144,7 +144,7 @@ def write_model(
     camera_of: Mapping[str, int] | None = None,
     text: bool = False,
 ) -> None:
-    """Writes a sparse model.
+    """Writes a sparse model of points that no image is said to see.
 
     Args:
         folder: the model's own folder (scene/sparse/0), made where missing.
@@ -155,6 +155,27 @@ def write_model(
         camera_of: image name -> position in ``cameras``; the first camera for all when left out.
         text: True for .txt files, False for .bin.
     """
+    model = posed_images(viewmats, cameras, camera_of)
+    for xyz, color in zip(points, colors, strict=True):
+        model.add_point3D(np.asarray(xyz, dtype=np.float64), pycolmap.Track(), np.asarray(color, dtype=np.uint8))
+    folder.mkdir(parents=True, exist_ok=True)
+    (model.write_text if text else model.write_binary)(str(folder))
+
+
+def posed_images(
+    viewmats: Mapping[str, np.ndarray],
+    cameras: Sequence[tuple[str, Sequence[float], int, int]],
+    camera_of: Mapping[str, int] | None = None,
+    keypoints: Mapping[str, np.ndarray] | None = None,
+) -> pycolmap.Reconstruction:
+    """A sparse model without points; images are numbered from 1 in the order of ``viewmats``, cameras in that of ``cameras``.
+
+    Args:
+        viewmats: as in ``write_model``.
+        cameras: as in ``write_model``.
+        camera_of: as in ``write_model``.
+        keypoints: image name -> features [K, 2] in pixels of its camera, from the image's corner; none when left out.
+    """
     model = pycolmap.Reconstruction()
     for i, (kind, params, width, height) in enumerate(cameras):
         camera = pycolmap.Camera(model=kind, width=width, height=height, params=list(params), camera_id=i + 1)
@@ -162,8 +183,7 @@ def write_model(
     for i, (name, viewmat) in enumerate(viewmats.items()):
         camera_id = 1 + (camera_of[name] if camera_of else 0)
         pose = pycolmap.Rigid3d(np.asarray(viewmat, dtype=np.float64)[:3])
-        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=camera_id, image_id=i + 1), pose)
-    for xyz, color in zip(points, colors, strict=True):
-        model.add_point3D(np.asarray(xyz, dtype=np.float64), pycolmap.Track(), np.asarray(color, dtype=np.uint8))
-    folder.mkdir(parents=True, exist_ok=True)
-    (model.write_text if text else model.write_binary)(str(folder))
+        seen = np.zeros((0, 2)) if keypoints is None else np.asarray(keypoints[name], dtype=np.float64)
+        image = pycolmap.Image(name=name, camera_id=camera_id, image_id=i + 1, keypoints=seen)
+        model.add_image_with_trivial_frame(image, pose)
+    return model

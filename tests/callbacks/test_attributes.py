@@ -172,6 +172,7 @@ def learned(folder, monkeypatch, scene=None, times=1.0, **options):
         scene=scene,
         # Of a view that no one took: a model that counts images by their numbers would tell of the first one alone.
         attributes=lambda frame: {} if frame.frame_id in taken else told,
+        splats=SimpleNamespace(means=torch.arange(306.0).reshape(102, 3)),
         output_dir=folder,
     )
     LearnedValues(**options).on_test_epoch_end(None, module)
@@ -192,6 +193,25 @@ def test_how_far_the_value_of_one_gaussian_is_off_stands_beside_where_it_is_aske
     assert row["deviation"] == 0.05
     text = "\n".join(learned_section(tmp_path))
     assert "± 0.05" in text and "median standard deviation" in text
+
+
+def test_what_is_true_stands_beside_where_the_scene_knows_it(tmp_path, monkeypatch):
+    """Over the Gaussians that views show, of which those that the model tells nothing of do not count."""
+
+    def truth(points):
+        assert points.shape == (102, 3)
+        return {"emissivity": torch.cat([torch.tensor([0.5, 0.5]), torch.full((100,), 0.99)]).double()}
+
+    (row,) = learned(tmp_path, monkeypatch, replace(wall(), true_attributes=truth))
+    assert row["truth"] == 0.5 and row["median"] == 0.4
+    text = "\n".join(learned_section(tmp_path))
+    assert "| median | truth | 90 % interval | unit |" in text and "| emissivity | 0.4 | 0.5 | 0.4 to 0.8 |" in text
+    assert "The truth is the median of what the scene has there." in text
+    for scene in (wall(), replace(wall(), true_attributes=lambda points: {"biot": torch.ones(len(points))})):
+        (row,) = learned(tmp_path, monkeypatch, scene)
+        assert "truth" not in row and "truth" not in "\n".join(learned_section(tmp_path))
+    mixed = attributes._true_median(torch.tensor([0.1, 0.2, 0.9]), np.array([np.nan, 0.5, np.nan]), np.ones(3))
+    assert mixed == pytest.approx(0.2) and attributes._true_median(None, np.ones(3), np.ones(3)) is None
 
 
 def test_what_no_surface_can_have_is_remarked(tmp_path, monkeypatch):

@@ -98,7 +98,8 @@ def test_a_transforms_file_without_points_trains_from_random_ones_which_nothing_
     (tmp_path / "tool" / "transforms.json").write_text(json.dumps(values))
     target = tmp_path / "scene"
     page = prepare(str(source), target, **PLAIN, poses=GivenPoses(str(tmp_path / "tool")))
-    assert "It has no points" in page.read_text()
+    said = "The cameras come without points, and only 0 could be triangulated from 0 matched pairs of features"
+    assert f"## Findings\n\n- {said}" in page.read_text() and "training starts from random ones" in page.read_text()
     np.testing.assert_allclose(read_model(target).viewmats[3], pose(3), atol=1e-12)
     scene = Colmap(root=str(target), random_points=50).scene
     assert scene.points.shape == (50, 3) and "the sparse model has none" in scene.notes["points_source"]
@@ -184,7 +185,7 @@ def test_cameras_of_metashape_place_the_scene_on_the_earth_by_its_reference(tmp_
         page = prepare(str(source), tmp_path / "scene", **PLAIN, poses=GivenPoses(str(model)))
     text = page.read_text()
     assert "5 of 6 frames have a camera" in text and "- IR_0005: it is disabled in Metashape" in text
-    assert "World: east, north, up in metres of the first camera" in text and "It has no points" in text
+    assert "World: east, north, up in metres of the first camera" in text and "The cameras come without points" in text
     assert json.loads((tmp_path / "scene" / "world.json").read_text()) == {
         "metres_per_unit": 1.0,
         "axes": "east, north, up",

@@ -15,7 +15,7 @@ from heatsplat.contracts import Frame, SceneData, check_count, evenly_spread
 from heatsplat.io.pictures import Bar, Panel, bounds_of, colorize, compose, text_panel, write_png
 from heatsplat.io.quantities import impossible, words_and_unit
 from heatsplat.io.tables import write_csv
-from heatsplat.metrics.attribute_errors import attribute_errors
+from heatsplat.metrics.attribute_errors import attribute_errors, true_values
 from heatsplat.shots import at_time, first_free_id
 from heatsplat.uncertainty import Uncertainty, shown
 
@@ -87,7 +87,8 @@ class LearnedValues(pl.Callback):
 
     Gaussians count by how much of the training views they show (``shown``), so that what stands behind a wall or far outside
     does not, however large; and at one moment, the middle of the record. Where a part of them has what no surface can have, such
-    as an absorptivity above 1, the column "remark" says how large it is.
+    as an absorptivity above 1, the column "remark" says how large it is. Where the scene knows what is true of some attribute,
+    the column "truth" has the median of that over the same Gaussians, counted alike.
 
     Args:
         views: training views, evenly spread, that tell how much Gaussians show; each is rendered once.
@@ -114,6 +115,9 @@ class LearnedValues(pl.Callback):
             weights = shown(module, scene.train.subset(evenly_spread(len(scene.train), self.views))).numpy()
             if self.deviations:
                 off = Uncertainty(module).of_attributes(frame)
+        true: dict[str, Tensor] = {}
+        if scene.true_attributes is not None:
+            true = true_values(told, scene.true_attributes(module.splats.means.detach().cpu()))
         rows = []
         for name, of_each in told.items():
             words, unit = words_and_unit(name)
@@ -128,13 +132,14 @@ class LearnedValues(pl.Callback):
                         "name": words,
                         "unit": unit,
                         "median": median,
+                        **({"truth": _true_median(true.get(name), values, weights)} if true else {}),
                         "low": low,
                         "high": high,
                         "deviation": deviation,
                         "remark": _remark(impossible(name, values, weights), scene) or None,
                     }
                 )
-        columns = ("name", "unit", "median", "low", "high", "deviation", "remark")
+        columns = ("name", "unit", "median", *(["truth"] if true else []), "low", "high", "deviation", "remark")
         write_csv(module.output_dir / LEARNED_FILE, rows, columns)
 
 
@@ -145,6 +150,13 @@ def _remark(found: str, scene: SceneData) -> str:
     weathers = [frame.environment for frame in scene.train.frames if frame.environment is not None]
     dark = weathers and not any(weather.irradiance_w_m2 for weather in weathers)
     return f"not told by these images: {found}" + ("; none was taken in daylight" if dark else "")
+
+
+def _true_median(truth: Tensor | None, values: np.ndarray, weights: np.ndarray) -> float | None:
+    """Weighted median of what is true of the Gaussians of which the model tells something; None where that is not known."""
+    told = np.isfinite(values)
+    found = None if truth is None else _quantiles(truth.cpu().numpy()[told], weights[told], (0.5,))
+    return None if found is None else float(f"{found[0]:.6g}")
 
 
 def _quantiles(values: np.ndarray, weights: np.ndarray, shares: tuple[float, ...]) -> np.ndarray | None:

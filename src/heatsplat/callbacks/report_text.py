@@ -169,9 +169,12 @@ def learned_section(folder: Path) -> list[str]:
         return []
     known = any(row["deviation"] for row in found)
     remarked = any(row.get("remark") for row in found)
+    true = any(row.get("truth") is not None for row in found)
     rows = []
     for row in found:
-        told = [row["name"], _number(row["median"]), f"{_number(row['low'])} to {_number(row['high'])}"]
+        truth = row.get("truth")
+        told = [row["name"], _number(row["median"]), *[NONE if truth is None else _number(truth)] * true]
+        told.append(f"{_number(row['low'])} to {_number(row['high'])}")
         told += [f"± {_number(row['deviation'])}" if row["deviation"] else NONE] * known
         rows.append((*told, row["unit"] or "", *[row.get("remark") or ""] * remarked))
     note = (
@@ -179,12 +182,13 @@ def learned_section(folder: Path) -> list[str]:
         "uncertainty of a "
         + ("value, which is the median standard deviation of one Gaussian. " if known else
            "value, which `evaluate.py callbacks=uncertainty` estimates. ")
+        + ("The truth is the median of what the scene has there. " if true else "")
         + f"Table: [{LEARNED_FILE}]({LEARNED_FILE})."
     )  # fmt: skip
     pictures = sorted((folder / "renders" / "attributes" / "test").glob("*.png"))[:1]
     maps = [_picture(path, folder, "maps of learned quantities") for path in pictures]
-    heads = ("", "median", "90 % interval", *["standard deviation"] * known, "unit", *["remark"] * remarked)
-    table = markdown_table(heads, rows, "lrr" + "r" * known + "l" + "l" * remarked)
+    heads = ("", "median", *["truth"] * true, "90 % interval", *["standard deviation"] * known, "unit")
+    table = markdown_table((*heads, *["remark"] * remarked), rows, "lrr" + "r" * (true + known) + "l" + "l" * remarked)
     return ["", "## Learned quantities", "", *table, "", note, "", *maps]
 
 

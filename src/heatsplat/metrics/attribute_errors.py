@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from torch import Tensor
 
@@ -31,12 +31,20 @@ def attribute_errors(
         weights: [n] how much each Gaussian counts, such as its opacity; None counts all alike.
     """
     errors = {}
-    for name, values in told.items():
-        true_name, factor = TRUE_NAMES.get(name, (name, 1.0))
-        if true_name not in truth:
-            continue
-        off = (values.double() - factor * truth[true_name].to(values.device).double()).abs()
+    for name, true in true_values(told, truth).items():
+        off = (told[name].double() - true.to(told[name].device)).abs()
         share = (off.new_ones(len(off)) if weights is None else weights.double()) * ~off.isnan()
         if float(share.sum()) > 0:
             errors[name] = float((off.nan_to_num() * share).sum() / share.sum())
     return errors
+
+
+def true_values(names: Iterable[str], truth: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """What is true of the attributes that a scene knows, each [n] float64, by the model's ``names`` and in the model's units.
+
+    Args:
+        names: as models call their attributes.
+        truth: by the names of ``SceneData.true_attributes``, each [n].
+    """
+    meant = {name: TRUE_NAMES.get(name, (name, 1.0)) for name in names}
+    return {name: factor * truth[true].double() for name, (true, factor) in meant.items() if true in truth}
