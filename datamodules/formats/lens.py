@@ -76,6 +76,12 @@ class Lens:
                 "principal point are pixels of that image"
             )
 
+    @classmethod
+    def pinhole(cls, matrix: np.ndarray, width: int, height: int) -> Lens:
+        """A lens without distortion from intrinsics [3, 3] in pixels of a ``width`` x ``height`` image."""
+        fx, fy, cx, cy = (float(matrix[i][j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return cls(fx, fy, cx, cy, width, height)
+
     @property
     def is_distorted(self) -> bool:
         """True when pixels do not lie where a pinhole would put them."""

@@ -63,8 +63,8 @@ def test_lenses_without_distortion_are_pinholes():
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (50, 50, 32, 24)
 
 
-def test_the_matrix_of_a_pinhole_follows_the_grid():
-    lens = Lens(50.0, 52.0, 31.0, 23.0, WIDTH, HEIGHT)
+def test_a_pinhole_comes_from_its_matrix():
+    lens = Lens.pinhole(np.array([[50.0, 0, 31], [0, 52, 23], [0, 0, 1]]), WIDTH, HEIGHT)
     assert not lens.is_distorted
     assert lens.matrix().tolist() == [[50, 0, 31], [0, 52, 23], [0, 0, 1]]
     assert lens.resized(32, 48).matrix().tolist() == [[25, 0, 15.5], [0, 52, 23], [0, 0, 1]]
