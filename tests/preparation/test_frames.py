@@ -10,7 +10,7 @@ from camera_files import dji_jpeg, raw_for, temperatures, with_segment
 from PIL import Image
 from recordings import START, STATED, read_frames, write_flir, write_images, write_sequence
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, as_written
 from heatsplat.preparation import frames
 from heatsplat.preparation.frames import Reading, read_recording
 from heatsplat.preparation.meaning import Meaning
@@ -45,7 +45,7 @@ def test_every_so_many_th_frame_of_each_camera_is_taken(tmp_path):
     assert [frame.name for frame in found.frames] == ["a0", "a3", "a6", "b0"]
     assert "every=3 takes 4 of 10 frames" in found.notes
     for wrong in (0, 1.5, True):
-        with pytest.raises(SceneError, match=f"every must be a whole number, 1 or more, got {wrong}"):
+        with pytest.raises(SceneError, match=f"every must be a whole number, 1 or more, got {as_written(wrong)}"):
             Reading(every=wrong)
 
 

@@ -244,9 +244,9 @@ def test_folders_of_long_knobs_have_names_that_file_systems_take():
     ("wrong", "message"),
     [
         ({"seeds": []}, r"study.seeds=\[\] has nothing in it"),
-        ({"scenes": None}, "study.scenes=None has nothing in it"),
+        ({"scenes": None}, "study.scenes=null has nothing in it"),
         ({"knobs": {"dtype": []}}, r"study.knobs.dtype=\[\] has nothing in it"),
-        ({"methods": {"etgs": {"dtype": None}}}, "study.methods.etgs.dtype=None has nothing in it"),
+        ({"methods": {"etgs": {"dtype": None}}}, "study.methods.etgs.dtype=null has nothing in it"),
         ({"knobs": "dtype"}, r"study.knobs=dtype: give settings with their values, such as \{max_steps"),
         ({"methods": {"etgs": 24}}, "study.methods.etgs=24: give settings with their values"),
     ],

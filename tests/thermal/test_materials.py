@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, as_written
 from heatsplat.thermal.materials import Materials, divided, moved, nearest
 
 CENTRES = np.array([[-9.0, -1.5, -0.5], [-6.0, -1.0, 0.5], [-10.5, 0.5, -1.0], [-8.0, -2.5, -0.2]])
@@ -73,5 +73,7 @@ def test_what_was_found_goes_on_from_a_checkpoint():
 
 @pytest.mark.parametrize("count", [0, 2.5, True])
 def test_what_is_no_number_of_materials_is_refused(count):
-    with pytest.raises(SceneError, match=f"thermal.materials must be a whole number, 1 or more, got {count}"):
+    with pytest.raises(
+        SceneError, match=f"thermal.materials must be a whole number, 1 or more, got {as_written(count)}"
+    ):
         Materials(count, 3)
