@@ -24,11 +24,11 @@ TOGETHER_K = 0.3
 
 def beside_balances(fit: Fit, balances: FullBalance, unit_k: float) -> tuple[Fit, Model] | None:
     """The joint fit in which each point goes as its own full balance may, and the model that it selects of what does not change
-    the scene over time; None where frames are too few to tell both, and where points do not follow such balances.
+    the scene over time; None where frames are too few to tell both, and where points do not follow such balances (ours).
 
     Args:
         fit: to which the weather record says roughly how surfaces change.
-        balances: of its points.
+        balances: of its P points in its F frames, temperatures in °C.
         unit_k: kelvin in a unit of the images.
     """
     ways = balances.ways(int(fit.data.usual_length) - MIN_FREE - 2)  # a level and the balance stand beside them

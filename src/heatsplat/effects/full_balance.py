@@ -101,7 +101,8 @@ class FullBalance:
 
     @cached_property
     def unlikely(self) -> float:
-        """Squares of the errors at all observations and of the numbers that fit them, of likely ones the least."""
+        """Sum over the points of what fits make least, in squares of what is to be expected: errors at all observations, far ones
+        no more than linear, and how far numbers are from those expected."""
         numbers, found = self._likeliest
         return float(self._unlikely(self.weights > 0, found, numbers).sum())
 

@@ -50,7 +50,7 @@ def starts(data: Data) -> Sequence[Model]:
 
 
 def in_common(fit: Fit, more: Model, less: Model) -> bool:
-    """``common_to_all``, and no heat; where nothing changes there is nothing to ask."""
+    """``common_to_all``, and more than balances of heat err together; where nothing changes there is nothing to ask."""
     return not fit.may_change(less) or common_to_all(fit, more, less) and not as_balances_err(fit, more, less)
 
 
