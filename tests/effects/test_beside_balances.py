@@ -10,7 +10,7 @@ from tracks import FRAMES, POINTS, data_of, drawn
 from weathered import HOUR_S, make_weather
 
 from heatsplat.effects import weather_record
-from heatsplat.effects.beside_balances import beside_balances
+from heatsplat.effects.beside_balances import beside_balances, beyond_balances
 from heatsplat.effects.full_balance import FullBalance
 from heatsplat.effects.joint.fit import fit_of
 from heatsplat.effects.joint.model import Model
@@ -100,3 +100,22 @@ def test_what_all_balances_may_miss_is_no_drift(common, heat):
 def test_without_balances_nothing_errs_as_they_do():
     fit = fit_of(data_of(temperatures() / UNIT_K + WALK_K / UNIT_K, noise=NOISE_K / UNIT_K))
     assert not as_balances_err(fit, Model.of(frame_offset=1), Model())
+
+
+def test_what_balances_could_say_as_well_is_not_taken_from_the_points():
+    fit, model = beside(temperatures() + WALK_K)
+    walk = fit.contributions(model)["frame_offset"]
+    assert beyond_balances(fit, model, walk) is walk  # as no balance goes
+    ways = fit.own(model)[1][..., 1:]
+    heat = 30.0 * ways.sum(2)
+    kept = beyond_balances(fit, model, heat + walk)
+    least = beyond_balances(fit, model, walk - 60.0 * ways[..., 0])
+    used = fit.weights > 0
+    assert kept[used].abs().max() < 0.2 * heat[used].abs().max()
+    assert torch.allclose(kept[used], least[used], atol=1e-3)  # of the walk, what no balance says
+    assert kept[used].abs().max() > 0.1 * walk.abs().max()
+
+
+def test_nothing_added_stays_nothing():
+    fit, model = beside(temperatures() + WALK_K)
+    assert not beyond_balances(fit, model, torch.zeros_like(fit.weights)).any()

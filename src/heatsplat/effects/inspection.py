@@ -8,7 +8,7 @@ from functools import cached_property
 from heatsplat.contracts import SceneData
 from heatsplat.effects import heat_source, weather_record
 from heatsplat.effects.base import Effect
-from heatsplat.effects.beside_balances import beside_balances
+from heatsplat.effects.beside_balances import beside_balances, beyond_balances
 from heatsplat.effects.image_motion import Delays, delays
 from heatsplat.effects.joint.certainty import Certainty
 from heatsplat.effects.joint.data import Data
@@ -126,6 +126,8 @@ class Inspection:
         added = sum(certain.values())
         if "fixed_pattern" in certain:
             added = added - added[fit.weights > 0].mean()  # nobody knows the level of a pattern
+        if certain and fit.data.balances is not None:
+            added = beyond_balances(fit, model, added)
         values = fit.data.tracks.values - added
         return Weathered(
             weather,
