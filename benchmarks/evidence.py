@@ -178,7 +178,7 @@ one rate, with a core, and of infinite depth.
   a drifting sensor, and 0.45 K and more in six with one; they count from 0.3 K on. Where
   balances could say nearly all of what the camera adds themselves (all but 0.04 of the squares), they keep it: on one of 21
   scenes a pattern had grown to 80 K, and the warmth of all points left with it. Of verdicts on the 45 outdoor scenes among 200
-  random ones 91.1 % are right, where 81.8 % were beside answers in general, and 1.0 % are wrong (1.4 % before).
+  random ones 91.1 % are right, where 81.8 % were beside answers in general, and 0.9 % are wrong (1.4 % before).
 - Where frames are too few for that, or points do not follow balances, the camera is judged beside answers in general. Errors of
   a record pass for vignetting there, and hide it: on five of 18 random scenes with it, none was found. What changes with
   the distance from the middle by a tenth of the noise, and is no clear falloff, is therefore in doubt, as is more than a tenth
