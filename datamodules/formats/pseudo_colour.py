@@ -1,0 +1,284 @@
+"""Levels of pictures in false colours: where on the curve of their palette each colour lies nearest.
+
+Colours are compared in luma and 0.35 of each chroma, of 256 (``palette.PERCEIVED``); all distances here are in these units. JPEG
+moves most pixels by less than 2 of them, and one in a hundred by 6 (quality 95) to 12 (75) where chroma is halved.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from heatsplat.contracts import SceneError, counted
+from heatsplat.datamodules.formats.images import PSEUDO_COLOUR_LEVELS, colour_levels
+from heatsplat.datamodules.formats.palette import PERCEIVED, Palette, known
+
+log = logging.getLogger(__name__)
+
+SAMPLES, BLOCK = 512, 8  # of a palette's curve, and of them that are taken together in looking for a second place
+FAR_BLOCKS = 6  # apart, so many make two places of the curve two temperatures: a tenth of the scale
+PER_UNIT = 4  # steps in which distances are kept; the largest that can be is 63
+CHUNK = 1024  # colours at a time: 2 MB of distances
+
+# What is drawn over a picture is farther than OFF from the curve, and what is blurred by it farther than BESIDE, within REACH
+# pixels of where at least TOGETHER of 3x3 pixels are off.
+OFF, BESIDE, REACH, TOGETHER = 14.0, 5.0, 2, 6
+MOST_OFF = 0.5  # share of an image that may be so
+MOST_MEDIAN = 6.0  # median distance of an image in another palette; of one in its own it is up to 3
+# A second place is as good where it is farther by less than this, and than so many times the image's median distance more.
+MARGIN, MARGIN_MEDIANS = 2.0, 2.0
+ROUNDS, WINDOW, FEWEST = (
+    8,
+    5,
+    5,
+)  # in which places are chosen by neighbours: pixels across, and how many of them must be certain
+SURE = 0.5  # share of the distance (in levels) of one place from the neighbours' mean that the other's must be below
+ALIKE = 6.0  # distance up to which two colours of a palette are one, in a JPEG
+MOST_ALIKE = 0.5  # share of a palette's levels that have the colour of others, above which it tells nothing
+
+
+@dataclass(frozen=True)
+class Levels:
+    """A picture as levels.
+
+    Args:
+        levels: [H, W] uint8, 0 at the cold end of the palette and 255 at the hot one.
+        known: [H, W] bool, True where the level is known.
+        off: pixels that are in none of the palette's colours.
+        undecided: pixels in colours of two levels, of which neighbours tell neither.
+        distance: median distance of the others from the palette.
+    """
+
+    levels: np.ndarray
+    known: np.ndarray
+    off: int
+    undecided: int
+    distance: float
+
+
+class PaletteReader:
+    """Tells levels from colours, each distinct colour of a scene once.
+
+    Args:
+        palette: of the pictures.
+
+    Raises:
+        SceneError: most levels of the palette have colours that others have, too.
+    """
+
+    def __init__(self, palette: Palette) -> None:
+        self.palette = palette
+        colours = palette.curve(SAMPLES)
+        self._middle = (colours @ PERCEIVED).mean(axis=0)
+        self._curve = (colours @ PERCEIVED - self._middle).astype(np.float32)
+        found = palette.curve(256)
+        self._spreads = found.max(axis=1) - found.min(axis=1)
+        # By colour, once it is known: level, distance + 1, second level, its distance + 1, each of 8 bits; 0 before. Pages of
+        # memory that no colour falls into are never touched.
+        self._table = np.zeros(1 << 24, np.uint32)
+        self.alike = self._alike(colours)
+        if self.alike.mean() > MOST_ALIKE:
+            raise SceneError(
+                f"data.palette: {100 * self.alike.mean():.0f} % of the levels of {palette.name} have colours of other levels, "
+                "too, so that its pictures tell no temperatures; train on the colours (data.thermal_channels=3, no °C)"
+            )
+
+    def _alike(self, colours: np.ndarray) -> np.ndarray:
+        """Which samples of the curve have the colour of another place, too, but for ``ALIKE``."""
+        _, nearest, _, second = self._places((colours @ PERCEIVED - self._middle).astype(np.float32))
+        return second.astype(np.int16) - nearest <= ALIKE * PER_UNIT
+
+    def note(self) -> str:
+        """The palette in words, and how much of it is ambiguous."""
+        said = self.palette.name
+        if share := float(self.alike.mean()):
+            at = np.flatnonzero(self.alike) / (SAMPLES - 1)
+            said += (
+                f"; {100 * share:.2g} % of its levels, between {100 * at.min():.0f} and {100 * at.max():.0f} % of the scale, "
+                "have colours of other levels, too, and neighbouring pixels tell which"
+            )
+        return said
+
+    def read(self, pixels: np.ndarray, counts: np.ndarray | None, name: str) -> Levels:
+        """The levels of a picture.
+
+        Args:
+            pixels: [H, W, 3] or [H, W], uint8.
+            counts: [H, W] bool, which pixels the picture is judged by; None for all.
+            name: of the picture, for messages.
+
+        Raises:
+            SceneError: the picture has more than 8 bits, or is in grey, or mostly in colours that the palette has not.
+        """
+        if pixels.dtype != np.uint8:
+            kind = "floating point" if pixels.dtype.kind == "f" else f"{8 * pixels.dtype.itemsize} bits"
+            raise SceneError(
+                f"image {name} is of {kind}, and pseudo-colour has 8 bits: its values are no colours of a palette; leave "
+                "data.palette out"
+            )
+        if pixels.ndim == 2:
+            pixels = np.repeat(pixels[..., None], 3, axis=2)
+        level, nearest, second_level, second = self._look_up(pixels)
+        judged = np.ones(level.shape, dtype=bool) if counts is None else counts
+        if judged.any():
+            self._check(pixels, nearest, level, judged, name)
+        off = nearest > OFF * PER_UNIT
+        if off.any():
+            off |= (_beside(off) > 0) & (nearest > BESIDE * PER_UNIT)
+        fits = ~off
+        distance = _median(np.bincount(nearest[fits], minlength=256)) / PER_UNIT
+        margin = PER_UNIT * (MARGIN + MARGIN_MEDIANS * distance)
+        doubtful = fits & (second - np.minimum(second, nearest) <= margin)
+        levels, sure = level, fits
+        if doubtful.any():
+            levels, sure = _chosen(level, second_level, fits & ~doubtful, doubtful)
+        if sure.any() and not sure.all():
+            levels = np.where(sure, levels, np.uint8(_median(np.bincount(levels[sure], minlength=256))))
+        undecided = int((fits & ~sure & judged).sum())
+        if undecided > MOST_OFF * judged.sum():
+            raise SceneError(
+                f"image {name}: {100 * undecided / judged.sum():.0f} % of its pixels have colours that {self.palette.name} has "
+                "at two levels; export the images in another palette, or greys, or mask out what is in these colours (masks/)"
+            )
+        return Levels(levels, sure, int((off & judged).sum()), undecided, distance)
+
+    def _check(self, pixels: np.ndarray, nearest: np.ndarray, level: np.ndarray, judged: np.ndarray, name: str) -> None:
+        """Raises SceneError where a picture is in another palette, or in grey."""
+        own = colour_levels(pixels if judged.all() else pixels[judged][None])
+        expected = float(self._spreads @ np.bincount(level[judged], minlength=256)) / judged.sum()
+        distances = np.bincount(nearest[judged], minlength=256)
+        off = float(distances[int(OFF * PER_UNIT) + 1 :].sum() / distances.sum())
+        median = _median(distances) / PER_UNIT
+        if (
+            own <= PSEUDO_COLOUR_LEVELS
+            and max(expected, self._spreads.mean() * (off > MOST_OFF)) > 3.0 * PSEUDO_COLOUR_LEVELS
+        ):
+            raise SceneError(
+                f"image {name} is grey, and {self.palette.name} is not: leave data.palette out for greys, and keep pictures in "
+                "grey and in colours in scenes of their own"
+            )
+        if off <= MOST_OFF and median <= MOST_MEDIAN:
+            return
+        others = _fitting(pixels[judged])
+        raise SceneError(
+            f"image {name} is not in the colours of {self.palette.name}: {100 * off:.0f} % of its pixels are far from all of "
+            f"them (median distance {median:.0f} of 256; {OFF:g} is far, and pictures in their own palette have 0 to 3). {others}"
+            "Give the palette of the images (data.palette=bar.png: their colour bar alone, cut out of one of them), leave out "
+            "images of another kind and those with edges of a photo drawn into them (MSX), or train on the colours as they are "
+            "(data.thermal_channels=3 without data.palette, no °C)"
+        )
+
+    def _look_up(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Level, distance * PER_UNIT, second level and its distance, each [H, W] uint8."""
+        codes = pixels[..., 0].astype(np.uint32) << 8
+        codes = (codes | pixels[..., 1]) << 8 | pixels[..., 2]
+        found = self._table[codes]
+        if not found.all():
+            new = np.unique(codes[found == 0])
+            for start in range(0, len(new), CHUNK):
+                some = new[start : start + CHUNK]
+                colours = np.stack([some >> 16, some >> 8 & 255, some & 255], axis=1).astype(np.float64)
+                places = self._places((colours @ PERCEIVED - self._middle).astype(np.float32))
+                # Threads that meet the same new colour write the same number.
+                self._table[some] = np.stack(places, axis=1).view("<u4")[:, 0]
+            found = self._table[codes]
+        parts = found.astype("<u4", copy=False).view(np.uint8).reshape(*found.shape, 4)
+        level, nearest, second_level, second = (np.ascontiguousarray(parts[..., i]) for i in range(4))
+        return level, nearest - np.uint8(1), second_level, second - np.uint8(1)
+
+    def _places(self, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of colours [n, 3] the nearest level (0 .. 255), 1 + its distance * PER_UNIT (1 .. 255), and both of the nearest one
+        that is far from that along the curve."""
+        squares = (self._curve**2).sum(axis=1) - 2.0 * colours @ self._curve.T
+        squares += (colours**2).sum(axis=1)[:, None]
+        blocks = squares.reshape(len(colours), -1, BLOCK)
+        least = blocks.min(axis=2)
+        rows = np.arange(len(colours))
+        first = least.argmin(axis=1)
+        apart = np.abs(np.arange(least.shape[1]) - first[:, None])
+        other = np.where(apart >= FAR_BLOCKS, least, np.inf).argmin(axis=1)
+        found = []
+        for block in (first, other):
+            at = block * BLOCK + blocks[rows, block].argmin(axis=1)
+            distance = np.sqrt(np.maximum(squares[rows, at], 0.0))
+            found += [np.rint(at * (255.0 / (SAMPLES - 1))), 1.0 + np.clip(np.rint(PER_UNIT * distance), 0, 254)]
+        return tuple(part.astype(np.uint8) for part in found)
+
+
+def _beside(off: np.ndarray) -> np.ndarray:
+    """Which pixels [H, W] lie within REACH of what is drawn over a picture: of pixels that are off together with most of those
+    around them, as those of strokes are and those of edges that JPEG moved are not."""
+    together = cv2.boxFilter(off.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    drawn = (off & (together >= TOGETHER)).astype(np.uint8)
+    return cv2.dilate(drawn, np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8))
+
+
+def _chosen(
+    level: np.ndarray, second: np.ndarray, certain: np.ndarray, doubtful: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Levels [H, W] uint8 of which doubtful ones are those of two that are nearer to neighbours, and where they are known.
+
+    Certainty spreads from certain pixels, two pixels a round; what lies between the two stays unknown.
+    """
+    values, certain = level.astype(np.float32), certain.copy()
+    window = (WINDOW, WINDOW)
+    for _ in range(ROUNDS):
+        count = cv2.boxFilter(certain.astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        total = cv2.boxFilter(values * certain, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        mean = total / np.maximum(count, 1.0)
+        here, there = np.abs(values - mean), np.abs(second - mean)
+        decided = doubtful & ~certain & (count >= FEWEST) & (np.minimum(here, there) < SURE * np.maximum(here, there))
+        if not decided.any():
+            break
+        values = np.where(decided & (there < here), second.astype(np.float32), values)
+        certain |= decided
+    return values.astype(np.uint8), certain
+
+
+def _median(counts: np.ndarray) -> float:
+    """Median of small whole numbers of which there are so many each; 0 of none."""
+    return float(np.searchsorted(np.cumsum(counts), counts.sum() / 2.0)) if counts.any() else 0.0
+
+
+def _fitting(pixels: np.ndarray) -> str:
+    """Which known palette fits pixels [n, 3] best, in words; empty where none does."""
+    some = pixels[:: max(1, len(pixels) // 1000)].astype(np.float64) @ PERCEIVED
+    best, least = "", MOST_MEDIAN / 2
+    for palette in known():
+        curve = palette.curve(128) @ PERCEIVED
+        squares = (curve**2).sum(axis=1) - 2.0 * some @ curve.T + (some**2).sum(axis=1)[:, None]
+        distance = float(np.sqrt(np.maximum(np.median(squares.min(axis=1)), 0.0)))
+        if distance < least:
+            best, least = palette.name, distance
+    return f"{best} fits ({least:.1f}; {best}_r if its cold end is the other one). " if best else ""
+
+
+def palette_notes(reader: PaletteReader, read: Iterable[tuple[str, Levels]]) -> dict[str, Any]:
+    """What the pictures of a scene have in common, for its notes; pixels that are left out are told.
+
+    Args:
+        reader: of their palette.
+        read: name and levels of each.
+    """
+    shares = {name: ((levels.off + levels.undecided) / levels.known.size, levels) for name, levels in read}
+    notes: dict[str, Any] = {"palette": reader.note()}
+    if reader.alike.any():
+        log.warning("data.palette: %s", notes["palette"])
+    distances = [levels.distance for _, levels in shares.values()]
+    notes["palette_distance"] = f"{np.median(distances):.2g} of 256 (median; JPEG of quality 75 has 1 to 3)"
+    worst = max(shares, key=lambda name: shares[name][0])
+    if most := shares[worst][0]:
+        mean = float(np.mean([share for share, _ in shares.values()]))
+        undecided = sum(levels.undecided > 0 for _, levels in shares.values())
+        notes["palette_left_out"] = (
+            f"{100 * mean:.2g} % of the pixels are in no colour of the palette (text, marks, edges), at most {100 * most:.2g} % "
+            f"({worst})"
+            + (f"; some of {counted(undecided, 'image')} are in colours of two levels" if undecided else "")
+        )
+        log.info("%s", notes["palette_left_out"])
+    return notes
