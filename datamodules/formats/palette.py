@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +16,7 @@ from heatsplat.datamodules.formats import flir
 from heatsplat.datamodules.formats.images import SUFFIXES, read_bytes, read_image, shown_files, split_alpha
 from heatsplat.datamodules.side_files import found_file
 
+KEY = "data.palette"
 EMBEDDED = "embedded"
 SIDES = ("top", "bottom", "left", "right")
 OPENCV = "opencv_"
@@ -46,11 +47,13 @@ class Palette:
         name: for messages.
         colours: RGB [N, 3] float64, 0 .. 255, from cold to hot; none equals the one before it.
         levels: [N] rising, in [0, 1]: where on the scale each stands.
+        key: of the setting that names it, for messages.
     """
 
     name: str
     colours: np.ndarray
     levels: np.ndarray
+    key: str = KEY
 
     def curve(self, count: int) -> np.ndarray:
         """Colours [count, 3] at evenly spaced levels from 0 to 1, straight between neighbouring entries."""
@@ -58,47 +61,46 @@ class Palette:
         return np.stack([np.interp(at, self.levels, channel) for channel in self.colours.T], axis=1)
 
 
-def palette_of(setting: str, hot: str | None, folder: Path | None) -> Palette:
-    """The palette that ``data.palette`` and ``data.palette_hot`` name.
+def palette_of(setting: str, hot: str | None, folder: Path | None, key: str = KEY) -> Palette:
+    """The palette that a setting and the one beside it (``data.palette``, ``data.palette_hot``) name.
 
     Args:
         setting: a name (``NAMES``), "embedded" for that in the FLIR files of the scene, or a file: the picture of a colour bar
             alone, or a FLIR file that holds a palette.
         hot: side of the bar at which it is hottest: top, bottom, left or right; None for top or right.
         folder: of the scene, in which files are looked for before the working directory; None where it has none.
+        key: of the setting.
 
     Raises:
         SceneError: there is no such name or file, or the file shows no palette.
     """
     if hot is not None:
-        check_option("data.palette_hot", hot, SIDES, SceneError)
+        check_option(f"{key}_hot", hot, SIDES, SceneError)
     if found := named(setting):
         palette = found
     elif setting == EMBEDDED:
-        palette = _embedded_in(folder)
+        palette = _embedded_in(folder, key)
     elif Path(setting).suffix.lower() in (*SUFFIXES, ".fff"):
-        path = found_file("data.palette", setting, folder)
+        path = found_file(key, setting, folder)
         if not flir.payload_of(read_bytes(path)):
-            return bar_of(path, hot)
+            return bar_of(path, hot, key)
         palette = _in_flir(path)
         if palette is None:
-            raise SceneError(f"data.palette={setting}: {path} is a FLIR file without a palette; give {_remedy()}")
+            raise SceneError(f"{key}={setting}: {path} is a FLIR file without a palette; give {_remedy(key)}")
     else:
         alike = difflib.get_close_matches(setting, [*_names()], 3)
         meant = f" (did you mean {' or '.join(alike)}?)" if alike else ""
-        raise SceneError(f"data.palette={setting} is no palette{meant}; give {_remedy()}")
+        raise SceneError(f"{key}={setting} is no palette{meant}; give {_remedy(key)}")
     if hot is not None:
         raise SceneError(
-            f"data.palette_hot={hot} is for the picture of a colour bar; of {palette.name}, _r behind the name turns the "
+            f"{key}_hot={hot} is for the picture of a colour bar; of {palette.name}, _r behind the name turns the "
             "direction round, and palettes in files have one"
         )
-    return palette
+    return replace(palette, key=key)
 
 
-def _remedy() -> str:
-    return (
-        f"one of {NAMES}, or the picture of the colour bar alone, cut out of one of the images (data.palette=bar.png)"
-    )
+def _remedy(key: str) -> str:
+    return f"one of {NAMES}, or the picture of the colour bar alone, cut out of one of the images ({key}=bar.png)"
 
 
 def named(name: str) -> Palette | None:
@@ -138,7 +140,7 @@ def _rgb(luma_chroma: np.ndarray) -> np.ndarray:
     return np.clip(np.stack([y + 1.402 * cr, y - 0.344136 * cb - 0.714136 * cr, y + 1.772 * cb], axis=1), 0.0, 255.0)
 
 
-def _palette(name: str, colours: np.ndarray, noise: float = 0.0) -> Palette:
+def _palette(name: str, colours: np.ndarray, noise: float = 0.0, key: str = KEY) -> Palette:
     """The palette of evenly spaced colours [N, 3]; those in a row that differ by no more than ``noise`` become one, in the middle
     of their levels."""
     compared = colours @ PERCEIVED
@@ -149,14 +151,15 @@ def _palette(name: str, colours: np.ndarray, noise: float = 0.0) -> Palette:
     runs = [slice(a, b) for a, b in zip(first, [*first[1:], len(colours)], strict=True)]
     at = np.linspace(0.0, 1.0, len(colours))
     if len(runs) < 2:
-        raise SceneError(f"data.palette: {name} shows one colour alone, which is no scale")
-    return Palette(name, np.stack([colours[r].mean(axis=0) for r in runs]), np.array([at[r].mean() for r in runs]))
+        raise SceneError(f"{key}: {name} shows one colour alone, which is no scale")
+    means = np.stack([colours[run].mean(axis=0) for run in runs])
+    return Palette(name, means, np.array([at[run].mean() for run in runs]), key)
 
 
 # Files ----------------------------------------------------------------------------------------------------------------
 
 
-def bar_of(path: Path, hot: str | None = None) -> Palette:
+def bar_of(path: Path, hot: str | None = None, key: str = KEY) -> Palette:
     """The palette of a picture of a colour bar, which is taken to lie along the side along which colours change.
 
     Colours are medians over the middle half of the bar, so that ticks at its sides do no harm; lines of a frame around it
@@ -165,20 +168,21 @@ def bar_of(path: Path, hot: str | None = None) -> Palette:
     Args:
         path: of the picture.
         hot: side at which it is hottest: top, bottom, left or right; None for top or right.
+        key: of the setting that names it.
 
     Raises:
         SceneError: it is no colour picture of 8 bits, too small, or shows no bar.
     """
     pixels, _ = split_alpha(read_image(path))
     if pixels.dtype != np.uint8 or pixels.ndim != 3:
-        raise SceneError(f"data.palette: {path} is no colour picture of 8 bits; cut the bar out of one of the images")
+        raise SceneError(f"{key}: {path} is no colour picture of 8 bits; cut the bar out of one of the images")
     pixels = pixels.astype(np.float64)
     spreads = [(_half(_middle(pixels, along)) @ PERCEIVED).std(axis=0).max() for along in (0, 1)]
     along = {None: int(np.argmax(spreads)), "left": 1, "right": 1}.get(hot, 0)
     if hot is None and max(spreads) < 2.0 * min(spreads):
         raise SceneError(
-            f"data.palette: {path} does not tell along which side its colours change; cut out the bar alone, without "
-            "its numbers, or say at which side it is hottest: data.palette_hot=top"
+            f"{key}: {path} does not tell along which side its colours change; cut out the bar alone, without "
+            f"its numbers, or say at which side it is hottest: {key}_hot=top"
         )
     line = _middle(pixels, along)
     across = _half(pixels.swapaxes(0, 1) if along == 0 else pixels)
@@ -187,12 +191,12 @@ def bar_of(path: Path, hot: str | None = None) -> Palette:
     if len(line) < MIN_BAR_PX or uneven > MOST_UNEVEN:
         what = f"{len(line)} pixels long" if len(line) < MIN_BAR_PX else "of several colours across"
         raise SceneError(
-            f"data.palette: {path} is {what}, and no colour bar of {MIN_BAR_PX} pixels or more; cut the bar alone, without its "
+            f"{key}: {path} is {what}, and no colour bar of {MIN_BAR_PX} pixels or more; cut the bar alone, without its "
             "numbers, out of one of the images"
         )
     if (hot or ("top", "right")[along]) in ("top", "left"):
         line = line[::-1]
-    return _palette(str(path), line, BAR_NOISE)
+    return _palette(str(path), line, BAR_NOISE, key)
 
 
 def _middle(pixels: np.ndarray, along: int) -> np.ndarray:
@@ -225,7 +229,7 @@ def _in_flir(path: Path) -> Palette | None:
     return None if found is None else _palette(f"the palette in {path}", _rgb(found))
 
 
-def _embedded_in(folder: Path | None) -> Palette:
+def _embedded_in(folder: Path | None, key: str) -> Palette:
     """The palette that the FLIR files of a scene hold. Raises SceneError where there is none, or they hold several."""
     found: list[tuple[Path, Palette]] = []
     paths: Iterable[Path] = () if folder is None else sorted(shown_files(folder, (".jpg", ".jpeg", ".fff")))
@@ -235,12 +239,12 @@ def _embedded_in(folder: Path | None) -> Palette:
             first, seen = found[0]
             if palette.colours.shape != seen.colours.shape or np.abs(palette.colours - seen.colours).max() > 2.0:
                 raise SceneError(
-                    f"data.palette={EMBEDDED}: {first} and {path} hold different palettes; put the pictures of each into a scene "
-                    f"of its own, or name the file whose palette all have: data.palette={first.name}"
+                    f"{key}={EMBEDDED}: {first} and {path} hold different palettes; put the pictures of each into a scene "
+                    f"of its own, or name the file whose palette all have: {key}={first.name}"
                 )
     if not found:
         raise SceneError(
-            f"data.palette={EMBEDDED}: no FLIR file in {folder} holds a palette; give {_remedy()}, or a FLIR file of the same "
+            f"{key}={EMBEDDED}: no FLIR file in {folder} holds a palette; give {_remedy(key)}, or a FLIR file of the same "
             "camera that holds one"
         )
     return found[0][1]

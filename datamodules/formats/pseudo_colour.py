@@ -25,9 +25,11 @@ FAR_BLOCKS = 6  # apart, so many make two places of the curve two temperatures: 
 PER_UNIT = 4  # steps in which distances are kept; the largest that can be is 63
 CHUNK = 1024  # colours at a time: 2 MB of distances
 
-# What is drawn over a picture is farther than OFF from the curve, and what is blurred by it farther than BESIDE, within REACH
-# pixels of where at least TOGETHER of 3x3 pixels are off.
-OFF, BESIDE, REACH, TOGETHER = 14.0, 5.0, 2, 6
+# Farther than OFF from the curve is what is drawn over a picture, and what lies beside an edge that JPEG has blurred. Luma and
+# chroma of the latter are those of levels within AROUND pixels, but for SLACK, only not together. The former is left out and
+# what it has blurred: what is farther than BESIDE within REACH pixels.
+OFF, AROUND, SLACK = 14.0, 4, 8.0
+BESIDE, REACH = 5.0, 2
 MOST_OFF = 0.5  # share of an image that may be so
 MOST_MEDIAN = 6.0  # median distance of an image in another palette; of one in its own it is up to 3
 # A second place is as good where it is farther by less than this, and than so many times the image's median distance more.
@@ -78,13 +80,14 @@ class PaletteReader:
         self._curve = (colours @ PERCEIVED - self._middle).astype(np.float32)
         found = palette.curve(256)
         self._spreads = found.max(axis=1) - found.min(axis=1)
+        self._ranges = _ranges(found @ PERCEIVED)
         # By colour, once it is known: level, distance + 1, second level, its distance + 1, each of 8 bits; 0 before. Pages of
         # memory that no colour falls into are never touched.
         self._table = np.zeros(1 << 24, np.uint32)
         self.alike = self._alike(colours)
         if self.alike.mean() > MOST_ALIKE:
             raise SceneError(
-                f"data.palette: {100 * self.alike.mean():.0f} % of the levels of {palette.name} have colours of other levels, "
+                f"{palette.key}: {100 * self.alike.mean():.0f} % of the levels of {palette.name} have colours of other levels, "
                 "too, so that its pictures tell no temperatures; train on the colours (data.thermal_channels=3, no °C)"
             )
 
@@ -119,7 +122,7 @@ class PaletteReader:
             kind = "floating point" if pixels.dtype.kind == "f" else f"{8 * pixels.dtype.itemsize} bits"
             raise SceneError(
                 f"image {name} is of {kind}, and pseudo-colour has 8 bits: its values are no colours of a palette; leave "
-                "data.palette out"
+                f"{self.palette.key} out"
             )
         if pixels.ndim == 2:
             pixels = np.repeat(pixels[..., None], 3, axis=2)
@@ -129,7 +132,9 @@ class PaletteReader:
             self._check(pixels, nearest, level, judged, name)
         off = nearest > OFF * PER_UNIT
         if off.any():
-            off |= (_beside(off) > 0) & (nearest > BESIDE * PER_UNIT)
+            drawn = self._drawn(pixels, level, off)
+            near = cv2.dilate(drawn.astype(np.uint8), np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)) > 0
+            off = drawn | (near & (nearest > BESIDE * PER_UNIT))
         fits = ~off
         distance = _median(np.bincount(nearest[fits], minlength=256)) / PER_UNIT
         margin = PER_UNIT * (MARGIN + MARGIN_MEDIANS * distance)
@@ -159,8 +164,8 @@ class PaletteReader:
             and max(expected, self._spreads.mean() * (off > MOST_OFF)) > 3.0 * PSEUDO_COLOUR_LEVELS
         ):
             raise SceneError(
-                f"image {name} is grey, and {self.palette.name} is not: leave data.palette out for greys, and keep pictures in "
-                "grey and in colours in scenes of their own"
+                f"image {name} is grey, and {self.palette.name} is not: leave {self.palette.key} out for greys, and keep "
+                "pictures in grey and in colours in scenes of their own"
             )
         if off <= MOST_OFF and median <= MOST_MEDIAN:
             return
@@ -168,9 +173,9 @@ class PaletteReader:
         raise SceneError(
             f"image {name} is not in the colours of {self.palette.name}: {100 * off:.0f} % of its pixels are far from all of "
             f"them (median distance {median:.0f} of 256; {OFF:g} is far, and pictures in their own palette have 0 to 3). {others}"
-            "Give the palette of the images (data.palette=bar.png: their colour bar alone, cut out of one of them), leave out "
-            "images of another kind and those with edges of a photo drawn into them (MSX), or train on the colours as they are "
-            "(data.thermal_channels=3 without data.palette, no °C)"
+            f"Give the palette of the images ({self.palette.key}=bar.png: their colour bar alone, cut out of one of them), leave "
+            "out images of another kind and those with edges of a photo drawn into them (MSX), or train on the colours as they "
+            "are (data.thermal_channels=3 without data.palette, no °C)"
         )
 
     def _look_up(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -191,6 +196,19 @@ class PaletteReader:
         level, nearest, second_level, second = (np.ascontiguousarray(parts[..., i]) for i in range(4))
         return level, nearest - np.uint8(1), second_level, second - np.uint8(1)
 
+    def _drawn(self, pixels: np.ndarray, level: np.ndarray, off: np.ndarray) -> np.ndarray:
+        """Which of the pixels [H, W] that are off have a luma or chroma that no level has between the lowest and the highest
+        around them: what is drawn over the picture, and no blurred edge."""
+        window = np.ones((2 * AROUND + 1, 2 * AROUND + 1), np.uint8)
+        low = cv2.erode(np.where(off, np.uint8(255), level), window)[off]
+        high = cv2.dilate(np.where(off, np.uint8(0), level), window)[off]
+        colours = pixels[off] @ PERCEIVED
+        least, most = self._ranges
+        inside = (colours >= least[low, high] - SLACK) & (colours <= most[low, high] + SLACK)
+        drawn = off.copy()
+        drawn[off] = (low > high) | ~inside.all(axis=1)
+        return drawn
+
     def _places(self, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of colours [n, 3] the nearest level (0 .. 255), 1 + its distance * PER_UNIT (1 .. 255), and both of the nearest one
         that is far from that along the curve."""
@@ -208,14 +226,6 @@ class PaletteReader:
             distance = np.sqrt(np.maximum(squares[rows, at], 0.0))
             found += [np.rint(at * (255.0 / (SAMPLES - 1))), 1.0 + np.clip(np.rint(PER_UNIT * distance), 0, 254)]
         return tuple(part.astype(np.uint8) for part in found)
-
-
-def _beside(off: np.ndarray) -> np.ndarray:
-    """Which pixels [H, W] lie within REACH of what is drawn over a picture: of pixels that are off together with most of those
-    around them, as those of strokes are and those of edges that JPEG moved are not."""
-    together = cv2.boxFilter(off.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    drawn = (off & (together >= TOGETHER)).astype(np.uint8)
-    return cv2.dilate(drawn, np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8))
 
 
 def _chosen(
@@ -238,6 +248,16 @@ def _chosen(
         values = np.where(decided & (there < here), second.astype(np.float32), values)
         certain |= decided
     return values.astype(np.uint8), certain
+
+
+def _ranges(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest of values [n, C] from one to another [n, n, C]."""
+    least = np.zeros((len(values), *values.shape), np.float32)
+    most = least.copy()
+    for first in range(len(values)):
+        least[first, first:] = np.minimum.accumulate(values[first:], axis=0)
+        most[first, first:] = np.maximum.accumulate(values[first:], axis=0)
+    return least, most
 
 
 def _median(counts: np.ndarray) -> float:
@@ -268,7 +288,7 @@ def palette_notes(reader: PaletteReader, read: Iterable[tuple[str, Levels]]) -> 
     shares = {name: ((levels.off + levels.undecided) / levels.known.size, levels) for name, levels in read}
     notes: dict[str, Any] = {"palette": reader.note()}
     if reader.alike.any():
-        log.warning("data.palette: %s", notes["palette"])
+        log.warning("%s: %s", reader.palette.key, notes["palette"])
     distances = [levels.distance for _, levels in shares.values()]
     notes["palette_distance"] = f"{np.median(distances):.2g} of 256 (median; JPEG of quality 75 has 1 to 3)"
     worst = max(shares, key=lambda name: shares[name][0])
@@ -276,7 +296,7 @@ def palette_notes(reader: PaletteReader, read: Iterable[tuple[str, Levels]]) -> 
         mean = float(np.mean([share for share, _ in shares.values()]))
         undecided = sum(levels.undecided > 0 for _, levels in shares.values())
         notes["palette_left_out"] = (
-            f"{100 * mean:.2g} % of the pixels are in no colour of the palette (text, marks, edges), at most {100 * most:.2g} % "
+            f"{100 * mean:.2g} % of the pixels are in no colour of the palette and left out (text, marks), at most {100 * most:.2g} % "
             f"({worst})"
             + (f"; some of {counted(undecided, 'image')} are in colours of two levels" if undecided else "")
         )

@@ -110,6 +110,17 @@ def test_what_is_drawn_over_the_picture_is_left_out(colour, quality):
     assert np.mean(errors(found, levels) > 5) <= (0.0 if quality is None else 0.02)
 
 
+def test_edges_that_jpeg_has_blurred_are_kept():
+    levels = np.where((COLUMNS // 21 + ROWS // 19) % 2, 0.15, 0.8)  # sharp edges
+    for name in ("iron", "jet"):
+        pixels = jpeg(coloured(levels, named(name)), 90, 2)
+        reader = PaletteReader(named(name))
+        distance = reader._look_up(pixels)[1] / 4
+        found = reader.read(pixels, None, "a.png")
+        assert np.mean(distance > 14) > 0.02 and found.off < 0.4 * np.sum(distance > 14)
+        assert np.percentile(errors(found, levels), 95) < 8
+
+
 def test_the_median_stands_where_nothing_is_known():
     pixels = coloured(np.full(SHAPE, 0.4), named("iron"))
     pixels[:10] = (0, 255, 0)
