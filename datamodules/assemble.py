@@ -120,7 +120,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
     raw = _with_pseudo_colour(raw, colour, options, notes)
     notes |= image_notes(prepared, options.downscale)
     if options.palette is not None:
-        notes |= palette_notes(options.palette, ((frames[i].name, p.levels) for i, p in prepared.items()))
+        notes |= palette_notes(options.palette, {frames[i].name: p.fit for i, p in prepared.items()})
 
     stored: dict[int, _Stored] = {}
     for i in used:

@@ -7,7 +7,7 @@ moves most pixels by less than 2 of them, and one in a hundred by 6 (quality 95)
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,22 +45,40 @@ MOST_ALIKE = 0.5  # share of a palette's levels that have the colour of others, 
 
 
 @dataclass(frozen=True)
+class Fit:
+    """How well a picture fits its palette.
+
+    Args:
+        pixels: that the picture has.
+        off: of those that count, in none of the palette's colours and beside no edge.
+        undecided: of those that count, in colours of two levels, of which neighbours tell neither.
+        distance: median distance of the others from the palette.
+    """
+
+    pixels: int
+    off: int
+    undecided: int
+    distance: float
+
+    @property
+    def left_out(self) -> float:
+        """Share of the pixels that are left out."""
+        return (self.off + self.undecided) / self.pixels
+
+
+@dataclass(frozen=True)
 class Levels:
     """A picture as levels.
 
     Args:
         levels: [H, W] uint8, 0 at the cold end of the palette and 255 at the hot one.
         known: [H, W] bool, True where the level is known.
-        off: pixels that are in none of the palette's colours.
-        undecided: pixels in colours of two levels, of which neighbours tell neither.
-        distance: median distance of the others from the palette.
+        fit: how well it fits.
     """
 
     levels: np.ndarray
     known: np.ndarray
-    off: int
-    undecided: int
-    distance: float
+    fit: Fit
 
 
 class PaletteReader:
@@ -150,7 +168,7 @@ class PaletteReader:
                 f"image {name}: {100 * undecided / judged.sum():.0f} % of its pixels have colours that {self.palette.name} has "
                 "at two levels; export the images in another palette, or greys, or mask out what is in these colours (masks/)"
             )
-        return Levels(levels, sure, int((off & judged).sum()), undecided, distance)
+        return Levels(levels, sure, Fit(levels.size, int((off & judged).sum()), undecided, distance))
 
     def _check(self, pixels: np.ndarray, nearest: np.ndarray, level: np.ndarray, judged: np.ndarray, name: str) -> None:
         """Raises SceneError where a picture is in another palette, or in grey."""
@@ -278,26 +296,26 @@ def _fitting(pixels: np.ndarray) -> str:
     return f"{best} fits ({least:.1f}; {best}_r if its cold end is the other one). " if best else ""
 
 
-def palette_notes(reader: PaletteReader, read: Iterable[tuple[str, Levels]]) -> dict[str, Any]:
+def palette_notes(reader: PaletteReader, fits: Mapping[str, Fit]) -> dict[str, Any]:
     """What the pictures of a scene have in common, for its notes; pixels that are left out are told.
 
     Args:
         reader: of their palette.
-        read: name and levels of each.
+        fits: of each by its name, one or more.
     """
-    shares = {name: ((levels.off + levels.undecided) / levels.known.size, levels) for name, levels in read}
     notes: dict[str, Any] = {"palette": reader.note()}
     if reader.alike.any():
         log.warning("%s: %s", reader.palette.key, notes["palette"])
-    distances = [levels.distance for _, levels in shares.values()]
-    notes["palette_distance"] = f"{np.median(distances):.2g} of 256 (median; JPEG of quality 75 has 1 to 3)"
-    worst = max(shares, key=lambda name: shares[name][0])
-    if most := shares[worst][0]:
-        mean = float(np.mean([share for share, _ in shares.values()]))
-        undecided = sum(levels.undecided > 0 for _, levels in shares.values())
+    notes["palette_distance"] = (
+        f"{np.median([fit.distance for fit in fits.values()]):.2g} of 256 (median; JPEG of quality 75 has 1 to 3)"
+    )
+    worst = max(fits, key=lambda name: fits[name].left_out)
+    if most := fits[worst].left_out:
+        mean = float(np.mean([fit.left_out for fit in fits.values()]))
+        undecided = sum(fit.undecided > 0 for fit in fits.values())
         notes["palette_left_out"] = (
-            f"{100 * mean:.2g} % of the pixels are in no colour of the palette and left out (text, marks), at most {100 * most:.2g} % "
-            f"({worst})"
+            f"{100 * mean:.2g} % of the pixels are in no colour of the palette and left out (text, marks), at most "
+            f"{100 * most:.2g} % ({worst})"
             + (f"; some of {counted(undecided, 'image')} are in colours of two levels" if undecided else "")
         )
         log.info("%s", notes["palette_left_out"])

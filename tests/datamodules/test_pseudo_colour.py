@@ -74,7 +74,7 @@ def test_jpeg_costs_a_hundredth_of_the_scale(name, quality, subsampling, median,
     found = read(jpeg(coloured(levels, named(name)), quality, subsampling), named(name))
     err = errors(found, levels)
     assert np.median(err) < median and np.percentile(err, 95) < most
-    assert found.off < 0.12 * levels.size
+    assert found.fit.off < 0.12 * levels.size
 
 
 def test_levels_lie_between_the_entries_of_a_coarse_palette():
@@ -117,7 +117,7 @@ def test_edges_that_jpeg_has_blurred_are_kept():
         reader = PaletteReader(named(name))
         distance = reader._look_up(pixels)[1] / 4
         found = reader.read(pixels, None, "a.png")
-        assert np.mean(distance > 14) > 0.02 and found.off < 0.4 * np.sum(distance > 14)
+        assert np.mean(distance > 14) > 0.02 and found.fit.off < 0.4 * np.sum(distance > 14)
         assert np.percentile(errors(found, levels), 95) < 8
 
 
@@ -126,7 +126,7 @@ def test_the_median_stands_where_nothing_is_known():
     pixels[:10] = (0, 255, 0)
     found = read(pixels, named("iron"))
     assert not found.known[:10].any() and np.all(np.abs(found.levels[:10] - 0.4 * 255) <= 1)
-    assert found.off == 10 * SHAPE[1]
+    assert found.fit.off == 10 * SHAPE[1]
 
 
 def test_another_palette_is_refused_with_the_file_and_the_one_that_fits():
@@ -145,7 +145,7 @@ def test_what_a_mask_leaves_out_judges_nothing():
         read(pixels, named("iron"))
     counts = ROWS >= 70
     found = read(pixels, named("iron"), counts)
-    assert found.off == 0 and found.known[70:].all()
+    assert found.fit.off == 0 and found.known[70:].all()
     assert not read(pixels, named("iron"), np.zeros(SHAPE, bool)).known[:70].any()  # nothing counts, nothing is judged
 
 
@@ -196,7 +196,7 @@ def test_a_palette_that_passes_its_own_colours_says_so(caplog):
     assert "% of its levels, between 0 and 100 % of the scale, have colours of other levels" in reader.note()
     levels = reader.read(coloured(0.4 + 0.2 * scene(), ROUND), None, "a.png")
     with caplog.at_level(logging.INFO):
-        notes = palette_notes(reader, [("a.png", levels)])
+        notes = palette_notes(reader, {"a.png": levels.fit})
     assert "have colours of other levels" in notes["palette"] and notes["palette"] in caplog.text
     assert PaletteReader(named("iron")).note() == "iron"
 
@@ -215,7 +215,7 @@ def test_where_neighbours_tell_nothing_nothing_is_known():
     levels = np.full(SHAPE, 0.5)
     levels[20:70, 30:90] = 0.0  # an island of blue, as far from the surroundings as hot blue is
     found = read(coloured(levels, ROUND), ROUND)
-    assert not found.known[30:60, 40:80].any() and found.undecided > 1500
+    assert not found.known[30:60, 40:80].any() and found.fit.undecided > 1500
     assert found.known[levels == 0.5].mean() > 0.99
     with pytest.raises(SceneError, match="image a.png: .* % of its pixels have colours that round has at two levels"):
         read(coloured(np.zeros(SHAPE), ROUND), ROUND)
@@ -241,11 +241,10 @@ def test_notes_tell_what_is_left_out_and_where_most():
     pixels = coloured(scene(), named("iron"))
     drawn = pixels.copy()
     drawn[:8] = (0, 255, 0)
-    notes = palette_notes(
-        reader, [(name, reader.read(p, None, name)) for name, p in (("a.png", pixels), ("b.png", drawn))]
-    )
+    pictures = {"a.png": pixels, "b.png": drawn}
+    notes = palette_notes(reader, {name: reader.read(p, None, name).fit for name, p in pictures.items()})
     assert notes["palette"] == "iron" and notes["palette_distance"].startswith("0")
     share = 100 * 8 / SHAPE[0]
     assert notes["palette_left_out"].startswith(f"{share / 2:.2g} % of the pixels are in no colour of the palette")
     assert f"at most {share:.2g} % (b.png)" in notes["palette_left_out"]
-    assert "palette_left_out" not in palette_notes(reader, [("a.png", reader.read(pixels, None, "a.png"))])
+    assert "palette_left_out" not in palette_notes(reader, {"a.png": reader.read(pixels, None, "a.png").fit})
