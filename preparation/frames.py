@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -41,6 +42,8 @@ from heatsplat.preparation.makers import RECORDS, exif_details, radiometric_fram
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.sharpness import sharpest
 from heatsplat.preparation.table import with_table
+
+log = logging.getLogger(__name__)
 
 # What makers and people put into names to tell the modalities of one exposure apart.
 MODALITY = re.compile(r"[_\-. ](T|V|W|Z|S|IR|R|RGB|VIS|thermal|visible|visual|photo)$", re.IGNORECASE)
@@ -350,6 +353,11 @@ def _frames_of(
                 continue
             load = partial(read_image if kind == "float" else _grey, path, page if several else None)
             found.append(ThermalFrame(name, path, number, load, **about))
+    if reader is not None:
+        found[0].load()
+        if doubt := reader.doubt():
+            notes.append(doubt)
+            log.warning("%s", doubt)
     calibrations = _calibrations(kind, found, folder, reading.meaning, notes)
     yield from (replace(frame, calibration=calibrations[frame.path]) for frame in found)
 

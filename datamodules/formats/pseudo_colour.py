@@ -34,12 +34,13 @@ MOST_OFF = 0.5  # share of an image that may be so
 MOST_MEDIAN = 6.0  # median distance of an image in another palette; of one in its own it is up to 3
 # A second place is as good where it is farther by less than this, and than so many times the image's median distance more.
 MARGIN, MARGIN_MEDIANS = 2.0, 2.0
-ROUNDS, WINDOW, FEWEST = (
-    8,
-    5,
-    5,
-)  # in which places are chosen by neighbours: pixels across, and how many of them must be certain
+# Rounds in which places are chosen by neighbours: those in so many pixels across, of which so many must be certain.
+ROUNDS, WINDOW, FEWEST = 8, 5, 5
 SURE = 0.5  # share of the distance (in levels) of one place from the neighbours' mean that the other's must be below
+# Pictures that are nearer than GOOD_FIT to their palette on average are in it; others are in another one that is nearer than
+# RIVAL of that. Of each picture every so many rows and columns are looked at, and of all pictures so many pixels.
+GOOD_FIT, RIVAL = 1.0, 0.5
+THINNED, MOST_LOOKED_AT = (7, 13), 2000
 ALIKE = 6.0  # distance up to which two colours of a palette are one, in a JPEG
 MOST_ALIKE = 0.5  # share of a palette's levels that have the colour of others, above which it tells nothing
 
@@ -102,6 +103,7 @@ class PaletteReader:
         # By colour, once it is known: level, distance + 1, second level, its distance + 1, each of 8 bits; 0 before. Pages of
         # memory that no colour falls into are never touched.
         self._table = np.zeros(1 << 24, np.uint32)
+        self._seen: list[np.ndarray] = []  # some pixels of each picture
         self.alike = self._alike(colours)
         if self.alike.mean() > MOST_ALIKE:
             raise SceneError(
@@ -125,6 +127,23 @@ class PaletteReader:
             )
         return said
 
+    def doubt(self) -> str:
+        """Which known palette fits the pictures that were read much better than their own, in words; empty where none does."""
+        seen = np.concatenate([np.zeros((0, 3), np.uint8), *self._seen])
+        some = seen[:: max(1, len(seen) // MOST_LOOKED_AT)] @ PERCEIVED
+        own = _misfit(some, self._curve + self._middle)
+        if own <= GOOD_FIT:
+            return ""
+        fits = {palette.name: _misfit(some, palette.curve(128) @ PERCEIVED) for palette in known()}
+        best = min(fits, key=fits.get)
+        if fits[best] >= RIVAL * own:
+            return ""
+        return (
+            f"the images fit the palette {best} much better (their colours lie {fits[best]:.1f} of 256 from it on average, and "
+            f"{own:.1f} from {self.palette.name}); if that is theirs, give {self.palette.key}={best}, or {best}_r if its cold "
+            "end is the other one"
+        )
+
     def read(self, pixels: np.ndarray, counts: np.ndarray | None, name: str) -> Levels:
         """The levels of a picture.
 
@@ -144,6 +163,8 @@ class PaletteReader:
             )
         if pixels.ndim == 2:
             pixels = np.repeat(pixels[..., None], 3, axis=2)
+        some = (slice(None, None, THINNED[0]), slice(None, None, THINNED[1]))
+        self._seen.append(pixels[some].reshape(-1, 3) if counts is None else pixels[some][counts[some]])
         level, nearest, second_level, second = self._look_up(pixels)
         judged = np.ones(level.shape, dtype=bool) if counts is None else counts
         if judged.any():
@@ -268,6 +289,14 @@ def _chosen(
     return values.astype(np.uint8), certain
 
 
+def _misfit(colours: np.ndarray, curve: np.ndarray) -> float:
+    """Mean distance of colours [n, 3] from a curve, of which more than OFF counts as OFF; 0 of none."""
+    if not len(colours):
+        return 0.0
+    squares = (curve**2).sum(axis=1) - 2.0 * colours @ curve.T + (colours**2).sum(axis=1)[:, None]
+    return float(np.sqrt(np.clip(squares.min(axis=1), 0.0, OFF**2)).mean())
+
+
 def _ranges(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest of values [n, C] from one to another [n, n, C]."""
     least = np.zeros((len(values), *values.shape), np.float32)
@@ -309,6 +338,9 @@ def palette_notes(reader: PaletteReader, fits: Mapping[str, Fit]) -> dict[str, A
     notes["palette_distance"] = (
         f"{np.median([fit.distance for fit in fits.values()]):.2g} of 256 (median; JPEG of quality 75 has 1 to 3)"
     )
+    if doubt := reader.doubt():
+        notes["palette_doubted"] = doubt
+        log.warning("%s", doubt)
     worst = max(fits, key=lambda name: fits[name].left_out)
     if most := fits[worst].left_out:
         mean = float(np.mean([fit.left_out for fit in fits.values()]))

@@ -1,5 +1,6 @@
 import io
 import logging
+import re
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -248,3 +249,18 @@ def test_notes_tell_what_is_left_out_and_where_most():
     assert notes["palette_left_out"].startswith(f"{share / 2:.2g} % of the pixels are in no colour of the palette")
     assert f"at most {share:.2g} % (b.png)" in notes["palette_left_out"]
     assert "palette_left_out" not in palette_notes(reader, {"a.png": reader.read(pixels, None, "a.png").fit})
+
+
+@pytest.mark.parametrize("true, given", [("iron", "inferno"), ("hot", "jet"), ("gist_heat", "hot"), ("plasma", "iron")])
+def test_another_palette_that_fits_much_better_is_told(true, given, caplog):
+    levels = np.tile(np.linspace(0.05, 0.75 if given == "jet" else 0.95, 256), (60, 1))  # colours that both nearly have
+    pixels = jpeg(coloured(levels, named(true)), 95, 2)
+    reader = PaletteReader(named(given))
+    found = reader.read(pixels, None, "a.png")
+    assert np.median(errors(found, levels)) > 3 and found.known.mean() > 0.5  # wrong, and not seen by the picture alone
+    notes = palette_notes(reader, {"a.png": found.fit})
+    assert re.search(rf"the images fit the palette (opencv_)?{true} much better", notes["palette_doubted"])
+    assert re.search(rf"give data.palette=(opencv_)?{true}, or (opencv_)?{true}_r", caplog.text)
+    right = PaletteReader(named(true))
+    assert "palette_doubted" not in palette_notes(right, {"a.png": right.read(pixels, None, "a.png").fit})
+    assert PaletteReader(named(true)).doubt() == ""  # nothing was read

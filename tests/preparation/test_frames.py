@@ -255,6 +255,11 @@ def test_palettes_that_do_not_fit_the_files_are_refused(tmp_path):
         read_frames(colours, Reading(palette="iron"))
     with pytest.raises(SceneError, match=r"a.png is not in the colours of jet: .*\(palette=bar.png"):
         read_frames(colours, Reading(bounds, palette="jet"))[0].load()
+    found = read_recording(
+        write_images(tmp_path / "like", {"a.png": coloured(np.tile(np.arange(20, 236, dtype=np.uint8), (30, 1)))}),
+        Reading(bounds, palette="inferno"),
+    )
+    assert any("the images fit the palette iron much better" in note for note in found.notes)
     with pytest.raises(SceneError, match="palette=irn is no palette .did you mean iron"):
         read_frames(colours, Reading(bounds, palette="irn"))
     with pytest.raises(SceneError, match="palette_hot=top is for the picture of a colour bar"):
