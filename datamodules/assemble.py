@@ -32,6 +32,7 @@ from heatsplat.contracts import (
 )
 from heatsplat.datamodules.bounds import BOUNDS_FILE, MIN_CELSIUS, celsius
 from heatsplat.datamodules.formats.images import PSEUDO_COLOUR_LEVELS
+from heatsplat.datamodules.formats.pseudo_colour import palette_notes
 from heatsplat.datamodules.poses import MAX_COORDINATE
 from heatsplat.datamodules.prepared_images import PreparedImage, check_equals, check_masks, image_notes, prepare
 from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
@@ -118,6 +119,8 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
     colour = {frames[i].name: p.colour for i, p in prepared.items() if p.colour > PSEUDO_COLOUR_LEVELS}
     raw = _with_pseudo_colour(raw, colour, options, notes)
     notes |= image_notes(prepared, options.downscale)
+    if options.palette is not None:
+        notes |= palette_notes(options.palette, {frames[i].name: p.fit for i, p in prepared.items()})
 
     stored: dict[int, _Stored] = {}
     for i in used:
@@ -304,15 +307,17 @@ def _with_pseudo_colour(
         raise SceneError(
             f"image {next(iter(colour))} of scene {raw.name} is pseudo-colour (its channels differ by "
             f"{max(colour.values()):.0f} grey levels on average), so its values are no temperatures although the scene "
-            "has bounds. Point the loader at grey images, or train on the colours with data.thermal_channels=3 (no °C)."
+            "has bounds. Name the palette (data.palette=iron, or a picture of its colour bar), point the loader at grey "
+            "images, or train on the colours with data.thermal_channels=3 (no °C)."
         )
     if colour:
         notes["pseudo_colour"] = (
             f"{counted(len(colour), 'image')} in pseudo-colour; the luma is used and is no temperature"
         )
         log.warning(
-            "%s, such as %s: a palette's luma need not rise with temperature. Give radiometric files, counts, or greys with "
-            "their bounds; data.thermal_channels=3 trains on the colours as they are, without °C",
+            "%s, such as %s: a palette's luma need not rise with temperature. Name the palette (data.palette=iron, or a picture "
+            "of its colour bar), or give radiometric files, counts, or greys with their bounds; data.thermal_channels=3 trains "
+            "on the colours as they are, without °C",
             *(notes["pseudo_colour"], next(iter(colour))),
         )
     return raw

@@ -20,6 +20,8 @@ from heatsplat.contracts import SceneData, SceneError, check_option, counted
 from heatsplat.datamodules.assemble import build_scene
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, split_alpha, to_grey
 from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.formats.palette import palette_of
+from heatsplat.datamodules.formats.pseudo_colour import PaletteReader
 from heatsplat.datamodules.lowres import Reduction, degraded
 from heatsplat.datamodules.raw_scene import CELSIUS, Counts, RawFrame, RawScene, SceneOptions
 from heatsplat.datamodules.splits import SplitRule
@@ -48,6 +50,8 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         every: of the training frames of each camera every so many-th is used (``SceneOptions``).
         seed: of the order of views, and of random points where a scene has none.
         thermal_channels: 1, or 3 for pseudo-colour without temperatures.
+        palette: of thermal images in pseudo-colour, by name or file, which makes greys of them (``palette_of``); None for none.
+        palette_hot: side at which the picture of a colour bar in ``palette`` is hottest; None for top or right.
         masks: folder in the scene with a mask <image name>.png per image (COLMAP's rule), which need not be there; None for none.
         mask_keep: "white" when white pixels count (COLMAP), "black" when they are left out.
         alpha_mask: True to leave out transparent pixels.
@@ -72,6 +76,8 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         every: int = 1,
         seed: int = 0,
         thermal_channels: int = 1,
+        palette: str | None = None,
+        palette_hot: str | None = None,
         masks: str | None = MASKS,
         mask_keep: str = "white",
         alpha_mask: bool = False,
@@ -89,6 +95,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         self.every = every
         self.seed = seed
         self.thermal_channels = thermal_channels
+        self.palette, self.palette_hot = palette, palette_hot
         self.masks = masks
         self.mask_keep = mask_keep
         self.alpha_mask = alpha_mask
@@ -204,9 +211,26 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         """``build_scene`` of a ``RawScene`` with this module's options."""
         multiple = Reduction.parse(self.degrade).factor if self.degrade else 1
         options = SceneOptions(
-            split or self.split, self.downscale, self.thermal_channels, self.alpha_mask, multiple, self.every
+            split or self.split,
+            self.downscale,
+            self.thermal_channels,
+            self.alpha_mask,
+            multiple,
+            self.every,
+            self._palette_reader(),
         )
         return build_scene(RawScene(name, frames, points, **scene), options)
+
+    def _palette_reader(self) -> PaletteReader | None:
+        """What makes levels of colours; None where no palette is given."""
+        if self.palette is None:
+            if self.palette_hot is not None:
+                raise SceneError(
+                    f"data.palette_hot={self.palette_hot} says how a colour bar lies; give it as data.palette"
+                )
+            return None
+        folder = Path(self.root).expanduser() / (self.scene_name or "") if self.root else None
+        return PaletteReader(palette_of(str(self.palette), self.palette_hot, folder))
 
 
 def _read_mask(path: Path, white_counts: bool) -> np.ndarray:

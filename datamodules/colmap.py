@@ -185,6 +185,12 @@ class Colmap(SceneDataModule):
                     f"{len(having)} of {len(files)} images are radiometric JPEGs, {lacking} is not; "
                     "remove the others, or take all as greys with data.radiometric=never"
                 )
+            if having and self.palette is not None:
+                raise SceneError(
+                    f"data.palette={self.palette} changes nothing for radiometric JPEGs such as {having[0]}, whose temperatures "
+                    "are read: leave it out (data.radiometric=never takes their pictures, and those have temperatures by "
+                    "data.palette and bounds)"
+                )
             if having:
                 return read_celsius, CELSIUS, "temperatures of radiometric JPEGs (emissivity 1, no atmosphere)"
         return read_thermal, None, "greys, linear between the bounds where there are any"

@@ -195,11 +195,12 @@ class Nerfstudio(SceneDataModule):
         if not unnamed or any(entry.thermal or "thermal_file_path" in entry.frame for entry in entries):
             return entries, False, {}
         pixels, _ = split_alpha(read_image(folder / unnamed[0]))
-        photos = colour_levels(pixels) > PSEUDO_COLOUR_LEVELS and bounds is None and self.thermal_channels == 1
+        pseudo_colour = self.thermal_channels == 3 or self.palette is not None
+        photos = colour_levels(pixels) > PSEUDO_COLOUR_LEVELS and bounds is None and not pseudo_colour
         what = "photos (they are in colour)" if photos else "thermal images"
         said = (
             f"images such as {unnamed[0]} are taken as {what}: no key, folder or bounds file says what they are. Name "
-            "thermal ones thermal_file_path, or set data.thermal_channels=3 for pseudo-colour"
+            "thermal ones thermal_file_path, or set data.palette (or data.thermal_channels=3) for pseudo-colour"
         )
         if not photos:
             entries = [replace(entry, thermal=entry.visible, visible=None) for entry in entries]

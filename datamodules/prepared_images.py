@@ -23,6 +23,7 @@ from heatsplat.datamodules.formats.images import (
     undistorted_mask,
 )
 from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.formats.pseudo_colour import Fit
 from heatsplat.datamodules.raw_scene import RawFrame, SceneOptions
 
 log = logging.getLogger(__name__)
@@ -42,7 +43,8 @@ class PreparedImage:
         thermal, rgb, mask: of one size; None for what the frame lacks.
         lens: without distortion, for that size.
         found: what the files held, for the notes.
-        colour: grey levels by which the channels of the thermal image differ on average.
+        colour: grey levels by which the channels of the thermal image differ on average; 0 where a palette made one of them.
+        fit: how well the thermal image fits its palette; None without one.
     """
 
     thermal: np.ndarray | None
@@ -51,6 +53,7 @@ class PreparedImage:
     lens: Lens
     found: dict[str, Any]
     colour: float
+    fit: Fit | None = None
 
 
 def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
@@ -78,6 +81,13 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
     own = _mask_of(frame, width, height)
     found["mask_resized"] = own is not None and own.shape != (height, width)
     mask = _both(alpha if options.alpha_mask else None, None if own is None else resized_mask(own, width, height))
+    fit = None
+    if options.palette is not None:
+        if frame.read is None:
+            raise SceneError("data.palette is of thermal images, and the scene has photos alone; leave it out")
+        levels = options.palette.read(pixels, mask, frame.name)
+        pixels, fit, colour = levels.levels, levels.fit, 0.0
+        mask = mask if levels.known.all() else _both(mask, levels.known)
     keeps_colour = frame.read is None or options.thermal_channels == 3
     if pixels.ndim == 3 and (pixels.dtype.kind == "f" or not keeps_colour):
         pixels = to_grey(pixels)
@@ -106,7 +116,7 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
         mask = None
     if frame.read is None:
         return PreparedImage(None, np.ascontiguousarray(pixels), mask, lens.resized(*small), found, colour=0.0)
-    return PreparedImage(np.ascontiguousarray(pixels), rgb, mask, lens.resized(*small), found, colour)
+    return PreparedImage(np.ascontiguousarray(pixels), rgb, mask, lens.resized(*small), found, colour, fit)
 
 
 def _shrunk(side: float, multiple: int) -> int:

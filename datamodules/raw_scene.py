@@ -12,6 +12,7 @@ from torch import Tensor
 
 from heatsplat.contracts import Environment, SceneError, ThermalRange, Weather, check_count
 from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.formats.pseudo_colour import PaletteReader
 from heatsplat.datamodules.poses import checked_pose
 from heatsplat.datamodules.splits import SplitRule
 
@@ -118,6 +119,7 @@ class SceneOptions:
         multiple: of which sides of images are that shrink, as close to W / d and H / d as that allows; 1 for any.
         every: of the training frames of each camera every so many-th is used, in the order of their times (of names without),
             the first one included; test frames are those of ``split``, or where it holds nothing out, some of the frames used.
+        palette: of thermal images in pseudo-colour, which makes greys of them; None where there is none to be read.
     """
 
     split: SplitRule
@@ -126,6 +128,7 @@ class SceneOptions:
     alpha_mask: bool = False
     multiple: int = 1
     every: int = 1
+    palette: PaletteReader | None = None
 
     def __post_init__(self) -> None:
         check_count("data.every", self.every)
@@ -133,3 +136,7 @@ class SceneOptions:
             raise SceneError(f"data.downscale must be 1 or larger, got {self.downscale}")
         if self.thermal_channels not in (1, 3):
             raise SceneError(f"data.thermal_channels must be 1 or 3, got {self.thermal_channels}")
+        if self.palette is not None and self.thermal_channels == 3:
+            raise SceneError(
+                "data.palette makes one channel of the colours, and data.thermal_channels=3 keeps them: give one of the two"
+            )

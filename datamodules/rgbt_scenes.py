@@ -1,4 +1,7 @@
-"""RGBT-Scenes, the data set of ThermalGaussian: paired visible and pseudo-colour thermal images, no temperatures."""
+"""RGBT-Scenes, the data set of ThermalGaussian: paired visible and pseudo-colour thermal images.
+
+The data set has no temperatures; where its palette is named and someone has written down bounds, there are.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from heatsplat.contracts import SceneData
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
 from heatsplat.datamodules.formats.colmap import SparseModel, find_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
+from heatsplat.datamodules.nerfstudio import bounds_of
 from heatsplat.datamodules.posed_frames import image_index, match_model, model_frames
 
 SUBSETS = {"train": "train", "test": "test", "eval": "test", "val": "test"}
@@ -20,10 +24,15 @@ class RGBTScenes(SceneDataModule):
 
     Args:
         rgb: True to load the visible images as well.
+        thermal_channels: 3 for the colours, 1 for their luma; None for 3, or for levels where ``palette`` is given.
         shared: options of every loader (``SceneDataModule``).
     """
 
-    def __init__(self, *, split: str = "folders", thermal_channels: int = 3, rgb: bool = True, **shared: Any) -> None:
+    def __init__(
+        self, *, split: str = "folders", thermal_channels: int | None = None, rgb: bool = True, **shared: Any
+    ) -> None:
+        if thermal_channels is None:
+            thermal_channels = 3 if shared.get("palette") is None else 1
         super().__init__(split=split, thermal_channels=thermal_channels, **shared)
         self.rgb = rgb
 
@@ -31,7 +40,15 @@ class RGBTScenes(SceneDataModule):
         folder = self.scene_folder(is_paired, "thermal/ or a sparse model (sparse/0)")
         model = read_model(folder)
         frames, notes = paired_frames(self, folder, model, self.rgb)
-        return self.finish(folder.name, frames, model.points, point_colors=model.colors, notes=notes)
+        bounds, bounds_notes = bounds_of(folder)
+        return self.finish(
+            folder.name,
+            frames,
+            model.points,
+            point_colors=model.colors,
+            thermal_range=bounds,
+            notes=notes | (bounds_notes if bounds else {}),
+        )
 
 
 def is_paired(folder: Path) -> bool:

@@ -57,6 +57,8 @@ def check(
     zone: str | None = None,
     table: str | None = None,
     table_columns: Mapping[str, str] | None = None,
+    palette: str | None = None,
+    palette_hot: str | None = None,
 ) -> list[Finding]:
     """Looks for what is wrong with a folder, prints a table of it, and writes it to doctor.json.
 
@@ -66,11 +68,19 @@ def check(
         downscale: factor by which images of a scene shrink before they are looked at.
         counts, bounds_c: of ``Meaning``, for a camera's files.
         zone, table, table_columns: of ``Reading``, for a camera's files.
+        palette, palette_hot: of pictures in false colours, of a scene or a camera's files (``palette_of``).
 
     Raises:
         SceneError: the folder holds neither, or something is said of a camera's files and it is a scene.
     """
-    reading = reading_of(counts=counts, bounds_c=bounds_c, zone=zone, table=table, table_columns=table_columns)
+    told = {
+        "zone": zone,
+        "table": table,
+        "table_columns": table_columns,
+        "palette": palette,
+        "palette_hot": palette_hot,
+    }
+    reading = reading_of(counts=counts, bounds_c=bounds_c, **told)
     materials, notes = materials_in(Path(folder).expanduser(), downscale, reading)
     said = {"bounds_c": bounds_c, "zone": zone, "table": table}
     said |= {f"counts.{name}": value for name, value in (counts or {}).items()}
@@ -127,13 +137,13 @@ def materials_in(
     """
     if not folder.is_dir():
         raise SceneError(f"check={folder}: there is no such folder")
-    if (loader := _loader_of(folder, downscale)) is not None:
+    reading = reading or Reading()
+    if (loader := _loader_of(folder, downscale, reading)) is not None:
         return {"": material_of(loader.scene)}, _assumed(loader)
     if scenes := sorted(path.parent for path in (folder / SCENES).glob(f"*/{META}")):
         raise SceneError(
             f"{folder} holds {counted(len(scenes), 'scene')} of the protocol: give one, such as {scenes[0]}"
         )
-    reading = reading or Reading()
     recording = recording or read_recording(folder, reading)
     devices = devices_of(recording.frames)
     notes = [f"{counted(len(device.frames), 'frame')} of {device.label}" for device in devices]
@@ -150,7 +160,7 @@ def examined(materials: Mapping[str, Material]) -> list[Finding]:
     return sorted(found, key=lambda one: -one.cost)
 
 
-def _loader_of(folder: Path, downscale: float) -> SceneDataModule | None:
+def _loader_of(folder: Path, downscale: float, reading: Reading) -> SceneDataModule | None:
     """What reads the scene in a folder, by its files; None where these are no scene.
 
     Layouts that look alike have other axes or bounds: the first that fits reads them. Where images lie beside a sparse model,
@@ -161,6 +171,8 @@ def _loader_of(folder: Path, downscale: float) -> SceneDataModule | None:
         return all((folder / name).exists() for name in names)
 
     given = {"root": str(folder), "downscale": downscale}
+    if reading.palette is not None:
+        given |= {"palette": reading.palette, "palette_hot": reading.palette_hot}
     model, both = find_model(folder) is not None, has(*FILES.values())
     if both and has(META, PROTOCOL_POINTS):  # the training images alone where test images are not handed out
         return Benchmark(**given) if _truth_of(folder).is_dir() else Nerfstudio(split="every_8th", **given)

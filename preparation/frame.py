@@ -97,6 +97,17 @@ class ThermalFrame:
         return self.load().astype(np.float32) if self.calibration is None else self.temperature()
 
 
+@dataclass(frozen=True)
+class ColouredFrame(ThermalFrame):
+    """A frame whose numbers a palette told from colours: levels from 0 to 255, NaN where it told none.
+
+    Args:
+        palette: its colours and levels; another one makes other temperatures of the same file.
+    """
+
+    palette: tuple[float, ...] = ()
+
+
 def frame_name(path: Path, folder: Path, number: int | None = None) -> str:
     """Name of a frame by its path below the folder of the recording, and by its number where the file holds several.
 

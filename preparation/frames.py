@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -28,17 +29,21 @@ from heatsplat.datamodules.formats.images import (
     shown_files,
     to_grey,
 )
+from heatsplat.datamodules.formats.palette import palette_of
+from heatsplat.datamodules.formats.pseudo_colour import PaletteReader
 from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.datamodules.formats.temperature_table import MIN_SIDE, read_temperature_table
 from heatsplat.datamodules.formats.temperature_table import SUFFIX as TABLE
 from heatsplat.datamodules.timestamps import dji_time, instant, zone_of
 from heatsplat.io.files import by_numbers
 from heatsplat.preparation.devices import devices_of, listed
-from heatsplat.preparation.frame import ThermalFrame, frame_name
+from heatsplat.preparation.frame import ColouredFrame, ThermalFrame, frame_name
 from heatsplat.preparation.makers import RECORDS, exif_details, radiometric_frames
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.sharpness import sharpest
 from heatsplat.preparation.table import with_table
+
+log = logging.getLogger(__name__)
 
 # What makers and people put into names to tell the modalities of one exposure apart.
 MODALITY = re.compile(r"[_\-. ](T|V|W|Z|S|IR|R|RGB|VIS|thermal|visible|visual|photo)$", re.IGNORECASE)
@@ -67,6 +72,8 @@ class Reading:
         columns: its columns: name, time, latitude_deg, longitude_deg, altitude_m, above_takeoff_m, yaw_deg, pitch_deg, roll_deg.
         every: of each camera every so many-th frame is taken, the first one included.
         sharpest: of each camera the sharpest of each ``every`` frames in a row is taken instead.
+        palette: of pictures in false colours, by name or file (``palette_of``), which makes greys of them; None for none.
+        palette_hot: side at which the picture of a colour bar in ``palette`` is hottest; None for top or right.
 
     Raises:
         SceneError: ``every`` is no whole number from 1 on, or 1 where the sharpest is to be taken.
@@ -78,8 +85,12 @@ class Reading:
     columns: Mapping[str, str] = field(default_factory=dict)
     every: int = 1
     sharpest: bool = False
+    palette: str | None = None
+    palette_hot: str | None = None
 
     def __post_init__(self) -> None:
+        if self.palette is None and self.palette_hot is not None:
+            raise SceneError(f"palette_hot={self.palette_hot} says how a colour bar lies; give it as palette")
         check_count("every", self.every)
         check_option("sharpest", self.sharpest, (True, False), SceneError)
         if self.sharpest and self.every == 1:
@@ -98,11 +109,13 @@ def reading_of(
     table_columns: Mapping[str, str] | None = None,
     every: int = 1,
     sharpest: bool = False,
+    palette: str | None = None,
+    palette_hot: str | None = None,
 ) -> Reading:
     """How a folder is read, from settings of a command: ``counts``, ``bounds_c`` and ``band_um`` are of ``Meaning``."""
     meaning = Meaning(**(counts or {}), bounds_c=bounds_c, band_um=band_um)
     place = Path(table).expanduser() if table else None
-    return Reading(meaning, zone, place, table_columns or {}, every, sharpest)
+    return Reading(meaning, zone, place, table_columns or {}, every, sharpest, palette, palette_hot)
 
 
 @dataclass(frozen=True)
@@ -124,7 +137,8 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         zone_of(reading.zone, "zone")
     if not folder.is_dir():
         raise SceneError(f"source={folder} is no folder")
-    kinds, tables = _kinds_in(folder, greys_known=reading.meaning.of_greys(folder)[0] is not None)
+    greys_known = reading.meaning.of_greys(folder)[0] is not None
+    kinds, tables = _kinds_in(folder, greys_known, reading.palette)
     kind = next(kind for kind in KINDS if kinds.get(kind))
     reading.meaning.check_use(kind, KINDS[kind])
     notes: list[str] = []
@@ -150,19 +164,26 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
     return Recording(frames, notes)
 
 
-def _kinds_in(folder: Path, greys_known: bool) -> tuple[dict[str, list[Path]], dict[Path, tuple[int, int]]]:
+def _kinds_in(
+    folder: Path, greys_known: bool, palette: str | None
+) -> tuple[dict[str, list[Path]], dict[Path, tuple[int, int]]]:
     """The images in a folder and below by their kind (``_kind``), one of ``KINDS`` beside greys; and width and height of those
     that are text, which is slow to read, and is read here anyway.
 
     Args:
         greys_known: whether it is known which temperatures greys are, as which sealed pictures may then be taken.
+        palette: with which pictures in colours are greys, None without; a file of that name is none of the images.
 
     Raises:
-        SceneError: there is no thermal image, there are several kinds, or one cannot be read.
+        SceneError: there is no thermal image, there are several kinds, or one cannot be read; or with a palette there are no
+            pictures in colours, or it is not known which temperatures greys are.
     """
     kinds: dict[str, list[Path]] = {}
     tables: dict[Path, tuple[int, int]] = {}
     found = [path for path in shown_files(folder, (*SUFFIXES, *RECORDS, TABLE)) if path.is_file()]
+    if palette is not None:
+        own = [place.absolute() / palette for place in (folder, Path())]
+        found = [path for path in found if path.absolute() not in own]
     for path in sorted(found, key=lambda p: by_numbers(p.relative_to(folder).as_posix())):
         if path.suffix.lower() == TABLE:
             if (pixels := read_temperature_table(path)) is None:
@@ -177,7 +198,9 @@ def _kinds_in(folder: Path, greys_known: bool) -> tuple[dict[str, list[Path]], d
                 "between these °C"
             )
         kinds.setdefault("colour" if kind == "sealed" else kind, []).append(path)
-    if "grey" not in kinds and not kinds.keys() & {"radiometric", "float", "counts"}:
+    if palette is not None:
+        kinds = _greys_of_palette(kinds, folder, greys_known, palette)
+    elif "grey" not in kinds and not kinds.keys() & {"radiometric", "float", "counts"}:
         kinds = _greys_in_colour(kinds, folder)
     there = [kind for kind in KINDS if kinds.get(kind)]
     if len([kind for kind in there if kind != "grey"]) > 1:
@@ -266,10 +289,28 @@ def _greys_in_colour(kinds: dict[str, list[Path]], folder: Path) -> dict[str, li
     if colour:
         raise SceneError(
             f"{folder} holds coloured pictures alone (such as {colour[0].name}): colours of a palette are no temperatures. "
-            "Export radiometric files, 16-bit counts, temperatures as TIFF, or greys with known bounds. Photos are not prepared: "
-            "with a COLMAP model beside their folder they train by data=colmap data.images=null data.rgb=FOLDER"
+            "Export radiometric files, 16-bit counts, temperatures as TIFF, or greys with known bounds; or name the palette and "
+            "what its ends are: palette=iron bounds_c=[min,max]. Photos are not prepared: with a COLMAP model beside their "
+            "folder they train by data=colmap data.images=null data.rgb=FOLDER"
         )
     return kinds
+
+
+def _greys_of_palette(
+    kinds: Mapping[str, list[Path]], folder: Path, greys_known: bool, palette: str
+) -> dict[str, list[Path]]:
+    """Pictures in colours as greys. Raises SceneError where there are none, or other thermal images, or no bounds."""
+    if other := next((kind for kind in KINDS if kinds.get(kind)), None):
+        raise SceneError(
+            f"palette={palette} is for pictures in false colours, and {folder} holds {KINDS[other]} (such as "
+            f"{kinds[other][0].name}): leave it out, or prepare pictures in colours from a folder of their own"
+        )
+    if kinds.get("colour") and not greys_known:
+        raise SceneError(
+            f"palette={palette} tells levels from the colours of {kinds['colour'][0].name} and others; say which temperatures "
+            "the ends of the scale are: bounds_c=[min,max], in °C"
+        )
+    return {"grey": kinds["colour"]} if kinds.get("colour") else dict(kinds)
 
 
 def _frames_of(
@@ -285,6 +326,10 @@ def _frames_of(
             yield from radiometric_frames(path, folder, reading.meaning, notes)
         return
     found = []
+    reader = None
+    if reading.palette is not None:
+        reader = PaletteReader(palette_of(reading.palette, reading.palette_hot, folder, "palette"))
+        notes.append(f"levels by the palette {reader.note()}")
     for path in paths:
         if path.suffix.lower() == TABLE:
             load = partial(read_temperature_table, path)
@@ -298,8 +343,21 @@ def _frames_of(
             notes.append(f"{path.name}: {len(pages)} images in one file, each is a frame")
         for number, page in enumerate(pages):
             name = frame_name(path, folder, number if several else None)
+            about = {"camera": camera, "size": size, **details}
+            if reader is not None:
+                colours = tuple(
+                    np.column_stack([reader.palette.colours, reader.palette.levels]).ravel().round(3).tolist()
+                )
+                load = partial(_levels, path, page if several else None, reader)
+                found.append(ColouredFrame(name, path, number, load, palette=colours, **about))
+                continue
             load = partial(read_image if kind == "float" else _grey, path, page if several else None)
-            found.append(ThermalFrame(name, path, number, load, camera=camera, size=size, **details))
+            found.append(ThermalFrame(name, path, number, load, **about))
+    if reader is not None:
+        found[0].load()
+        if doubt := reader.doubt():
+            notes.append(doubt)
+            log.warning("%s", doubt)
     calibrations = _calibrations(kind, found, folder, reading.meaning, notes)
     yield from (replace(frame, calibration=calibrations[frame.path]) for frame in found)
 
@@ -334,6 +392,13 @@ def _calibrations(
 def _grey(path: Path, page: int | None) -> np.ndarray:
     pixels = read_image(path, page)
     return to_grey(pixels[..., :3]) if pixels.ndim == 3 else pixels
+
+
+def _levels(path: Path, page: int | None, reader: PaletteReader) -> np.ndarray:
+    """Levels [H, W] float32 from 0 to 255 of a picture in colours, NaN where its palette tells none."""
+    pixels = read_image(path, page)
+    found = reader.read(pixels[..., :3] if pixels.ndim == 3 else pixels, None, str(path))
+    return np.where(found.known, found.levels, np.float32(np.nan)).astype(np.float32)
 
 
 def _exposure(path: Path) -> str:

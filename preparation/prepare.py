@@ -45,6 +45,8 @@ def prepare(
     table_columns: Mapping[str, str] | None = None,
     every: int = 1,
     sharpest: bool = False,
+    palette: str | None = None,
+    palette_hot: str | None = None,
     keep_counts: bool = False,
     doctor: Doctor | None = None,
     poses: Poses | None = None,
@@ -62,7 +64,7 @@ def prepare(
         uncertainty: arguments of ``InputUncertainty``.
         counts: ``scale``, ``offset_c`` and ``planck`` of ``Meaning``.
         bounds_c, band_um: of ``Meaning``.
-        zone, table, table_columns, every, sharpest: of ``Reading``.
+        zone, table, table_columns, every, sharpest, palette, palette_hot: of ``Reading``.
         keep_counts: also write the numbers as the camera stored them.
         doctor: looks at the folder first, and at the scene once it has cameras, or None.
         poses: finds the cameras, or None.
@@ -87,6 +89,8 @@ def prepare(
         table_columns=table_columns,
         every=every,
         sharpest=sharpest,
+        palette=palette,
+        palette_hot=palette_hot,
     )
     found = read_recording(folder, reading)
     for note in found.notes:

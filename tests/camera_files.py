@@ -49,7 +49,7 @@ def gps_record(latitude, longitude, altitude):
     return bytes(record)
 
 
-def fff(raw, order="<", png=False, pixels=None, camera=None, gps=None, picture=None):
+def fff(raw, order="<", png=False, pixels=None, camera=None, gps=None, picture=None, palette=None):
     """An FFF file with a raw image, a camera record in the given byte order, and more records where they are given."""
     head = bytearray(32)
     struct.pack_into(f"{order}HHH", head, 0, 2, raw.shape[1], raw.shape[0])
@@ -60,6 +60,7 @@ def fff(raw, order="<", png=False, pixels=None, camera=None, gps=None, picture=N
     records = [(1, bytes(head) + pixels), (32, camera or camera_record(order))]
     records += [(43, gps)] if gps else []
     records += [(14, bytes(32) + picture)] if picture else []
+    records += [(34, palette)] if palette else []
     header = bytearray(64)
     header[:4] = b"FFF\0"
     struct.pack_into(">III", header, 20, 100, 64, len(records))
@@ -72,18 +73,26 @@ def fff(raw, order="<", png=False, pixels=None, camera=None, gps=None, picture=N
     return bytes(header) + bytes(directory) + b"".join(record for _, record in records)
 
 
-def jpeg_with(marker, blocks):
-    """A JPEG with extra segments after its first marker."""
-    picture = cv2.imencode(".jpg", np.full((HEIGHT, WIDTH), 90, np.uint8))[1].tobytes()
+def palette_record(luma_red_blue):
+    """A record of colours [N, 3] uint8 in FLIR's order: luma, red and blue chroma."""
+    return bytes([len(luma_red_blue)]) + bytes(0x6F) + luma_red_blue.astype(np.uint8).tobytes()
+
+
+def jpeg_with(marker, blocks, shown=None):
+    """A JPEG with extra segments after its first marker; ``shown`` is the picture in it, greys or RGB."""
+    shown = np.full((HEIGHT, WIDTH), 90, np.uint8) if shown is None else shown[..., ::-1] if shown.ndim == 3 else shown
+    picture = cv2.imencode(".jpg", shown)[1].tobytes()
     segments = b"".join(bytes([0xFF, marker]) + struct.pack(">H", len(b) + 2) + b for b in blocks)
     return picture[:2] + segments + picture[2:]
 
 
-def flir_jpeg(raw, **options):
+def flir_jpeg(raw, shown=None, **options):
     data = fff(raw, **options)
     parts = [data[i : i + 2000] for i in range(0, len(data), 2000)]
     blocks = [b"FLIR\0\x01" + bytes([i, len(parts) - 1]) + part for i, part in enumerate(parts)]
-    return jpeg_with(0xE1, [b"Exif\0\0nothing", *blocks[::-1]])  # blocks are numbered, their order does not count
+    return jpeg_with(
+        0xE1, [b"Exif\0\0nothing", *blocks[::-1]], shown
+    )  # blocks are numbered, their order does not count
 
 
 def dji_jpeg(raw):

@@ -21,7 +21,7 @@ from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.jpeg import segments
 from heatsplat.physics.radiometry import LIMITS, Atmosphere, Conditions, PlanckResponse
 
-RAW_IMAGE, EMBEDDED_PICTURE, CAMERA, GPS = 1, 14, 32, 43  # kinds of records
+RAW_IMAGE, EMBEDDED_PICTURE, CAMERA, PALETTE, GPS = 1, 14, 32, 34, 43  # kinds of records
 MOST_RECORDS = 4096
 MOST_PIXELS = 1 << 26
 
@@ -132,6 +132,15 @@ class Record:
         """The photo of the camera's second lens as the bytes of a JPEG or PNG, or None."""
         pixels = self.records.get(EMBEDDED_PICTURE, b"")[32:]
         return pixels if pixels[:2] == b"\xff\xd8" or pixels[:4] == b"\x89PNG" else None
+
+    def palette(self) -> np.ndarray | None:
+        """Luma (0 .. 255), red and blue chroma (around 0) [N, 3] float64 of the picture's colours from cold to hot, or None."""
+        record = self.records.get(PALETTE, b"")
+        count = record[0] if record else 0
+        entries = record[0x70 : 0x70 + 3 * count]
+        if count < 2 or len(entries) < 3 * count:
+            return None
+        return np.frombuffer(entries, np.uint8).reshape(count, 3) - np.array([0.0, 128.0, 128.0])
 
     def measured(self) -> Measured:
         """Calibration and object parameters. Raises SceneError where no plausible calibration is in the file."""

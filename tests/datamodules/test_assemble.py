@@ -8,6 +8,9 @@ from layouts import FOCAL, HEIGHT, WIDTH, grey, points, viewmats
 from heatsplat.contracts import SceneError, ThermalRange
 from heatsplat.datamodules.base import CELSIUS, Counts, RawFrame, RawScene, SceneDataModule, SceneOptions, build_scene
 from heatsplat.datamodules.formats.lens import Lens
+from heatsplat.datamodules.formats.palette import named
+from heatsplat.datamodules.formats.pseudo_colour import PaletteReader
+from heatsplat.datamodules.prepared_images import prepare
 from heatsplat.datamodules.splits import SplitRule
 
 LENS = Lens(fx=FOCAL, fy=FOCAL + 2, cx=20.5, cy=15.0, width=WIDTH, height=HEIGHT)
@@ -29,7 +32,9 @@ def frames_of(images, times=None, lens=LENS, center=(0, 0, 0), **fields):
 
 
 def assembled(frames, xyz, split=EVERY_8TH, **given):
-    options = {key: given.pop(key) for key in ("downscale", "thermal_channels", "alpha_mask") if key in given}
+    options = {
+        key: given.pop(key) for key in ("downscale", "thermal_channels", "alpha_mask", "palette") if key in given
+    }
     return build_scene(RawScene("s", frames, xyz, **given), SceneOptions(split, **options))
 
 
@@ -351,7 +356,9 @@ def pseudo_colour(index):
 
 def test_pseudo_colour_is_no_temperature(caplog):
     images = [pseudo_colour(i) for i in range(9)]
-    with pytest.raises(SceneError, match=r"image 0\d\d.png of scene s is pseudo-colour.*data.thermal_channels=3"):
+    with pytest.raises(
+        SceneError, match=r"image 0\d\d.png of scene s is pseudo-colour.*data.palette=iron.*data.thermal_channels=3"
+    ):
         scene_of(images, thermal_range=ThermalRange(0, 1))
     colour = scene_of(images, thermal_range=ThermalRange(0, 1), thermal_channels=3)
     assert colour.thermal_range is None and "bounds_ignored" in colour.notes
@@ -361,6 +368,106 @@ def test_pseudo_colour_is_no_temperature(caplog):
     assert luma.train[0].thermal.shape == (HEIGHT, WIDTH, 1)
     assert "luma" in luma.notes["pseudo_colour"]
     assert "9 images in pseudo-colour" in caplog.text and "data.thermal_channels=3" in caplog.text
+    assert "data.palette=iron" in caplog.text
+
+
+def palette_reader(name="opencv_inferno"):
+    return PaletteReader(named(name))
+
+
+def test_a_palette_makes_of_colours_the_temperatures_that_greys_have(caplog):
+    bounds = ThermalRange(-10, 41)
+    greys = scene_of([grey(i) for i in range(9)], thermal_range=bounds)
+    with caplog.at_level(logging.WARNING):
+        scene = scene_of([pseudo_colour(i) for i in range(9)], thermal_range=bounds, palette=palette_reader())
+    assert not caplog.records
+    assert scene.thermal_range == bounds and scene.notes["thermal_range_c"] == greys.notes["thermal_range_c"]
+    assert scene.notes["palette"] == "opencv_inferno" and "palette_left_out" not in scene.notes
+    assert "pseudo_colour" not in scene.notes
+    for views, others in ((scene.train, greys.train), (scene.test, greys.test)):
+        for i in range(len(views)):
+            assert views[i].mask is None and views[i].thermal.shape == (HEIGHT, WIDTH, 1)
+            assert torch.abs(views[i].thermal - others[i].thermal).max() <= 1.01 / 255
+    assert scene_of([pseudo_colour(i) for i in range(9)], palette=palette_reader()).thermal_range is None
+
+
+def test_levels_are_kept_as_eight_bit_greys_are():
+    frame = frames_of([pseudo_colour(3)])[0]
+    found = prepare(frame, SceneOptions(EVERY_8TH, palette=palette_reader()))
+    assert found.thermal.dtype == np.uint8 and found.thermal.shape == (HEIGHT, WIDTH)
+    assert found.thermal.flags["C_CONTIGUOUS"] and found.colour == 0.0
+
+
+def test_levels_are_averaged_and_not_colours():
+    levels = np.tile(np.uint8([[40, 220], [220, 40]]), (HEIGHT // 2, WIDTH // 2))
+    colours = np.rint(named("jet").curve(256)[levels]).astype(np.uint8)
+    images = [colours if i == 1 else np.rint(named("jet").curve(256)[grey(i)]).astype(np.uint8) for i in range(9)]
+    view = scene_of(images, palette=palette_reader("jet"), downscale=2).train[0]
+    assert view.mask is None
+    np.testing.assert_allclose(255 * view.thermal, 130, atol=1.5)
+    averaged = colours.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
+    assert averaged[0, 0, 2] > 100 and averaged[0, 0, 0] > 100  # a violet that the palette has not
+
+
+def drawn_over(index):
+    pixels = pseudo_colour(index)
+    pixels[4:12, 6:30] = (0, 255, 0)
+    return pixels
+
+
+def test_what_is_drawn_over_pictures_is_masked_beside_masks_of_ones_own(caplog):
+    own = np.ones((HEIGHT, WIDTH), bool)
+    own[:, 30:] = False
+    frames = frames_of([drawn_over(i) for i in range(9)], read_mask=[lambda: own] * 9)
+    with caplog.at_level(logging.INFO):
+        scene = scene_of(None, frames=frames, palette=palette_reader(), thermal_range=ThermalRange(0, 10))
+    expected = own.copy()
+    expected[4:12, 6:30] = False
+    for view in (scene.train[2], scene.test[0]):
+        np.testing.assert_array_equal(view.mask, expected)
+    share = 100 * (8 * 24) / (HEIGHT * WIDTH)
+    assert f"{share:.2g} % of the pixels are in no colour of the palette" in scene.notes["palette_left_out"]
+    assert scene.notes["palette_left_out"] in caplog.text
+    assert scene.notes["masked_fraction"] == pytest.approx(1 - expected.mean())
+    small = scene_of(None, frames=frames, palette=palette_reader(), downscale=4).train[0]
+    assert not small.mask[1:3, 2:7].any() and not small.mask[:, 7].any() and small.mask[3:, :7].all()
+
+
+def test_transparency_and_palettes_go_together():
+    images = [np.dstack([pseudo_colour(i), np.full((HEIGHT, WIDTH), 255, np.uint8)]) for i in range(9)]
+    for image in images:
+        image[:5, :, 3] = 0
+    assert scene_of(images, palette=palette_reader()).train[0].mask is None
+    for image in images:
+        image[:5, :, :3] = (0, 255, 0)  # of what is transparent colours tell nothing
+    mask = scene_of(images, palette=palette_reader(), alpha_mask=True).train[0].mask
+    assert not mask[:5].any() and mask[5:].all()
+
+
+def test_palettes_are_refused_where_there_is_no_pseudo_colour():
+    for images, says in (
+        ([grey(i) for i in range(9)], r"image 00.\.png is grey"),
+        ([np.repeat(grey(i)[..., None], 3, axis=2) for i in range(9)], r"image 00.\.png is grey"),
+        ([grey(i, np.uint16) for i in range(9)], r"image 00.\.png is of 16 bits"),
+        ([grey(i).astype(np.float32) for i in range(9)], r"image 00.\.png is of floating point"),
+    ):
+        with pytest.raises(SceneError, match=says):
+            scene_of(images, palette=palette_reader())
+    with pytest.raises(SceneError, match="data.palette makes one channel .* data.thermal_channels=3 keeps them"):
+        scene_of([pseudo_colour(i) for i in range(9)], palette=palette_reader(), thermal_channels=3)
+    photos = [
+        RawFrame(f"{i}.png", viewmat, LENS, read=None, read_rgb=lambda: pseudo_colour(0))
+        for i, viewmat in enumerate(viewmats(9))
+    ]
+    with pytest.raises(SceneError, match="data.palette is of thermal images, and the scene has photos alone"):
+        assembled(photos, points(), palette=palette_reader())
+
+
+def test_one_picture_in_another_palette_is_named():
+    images = [pseudo_colour(i) for i in range(9)]
+    images[5] = np.rint(named("jet").curve(256)[grey(5)]).astype(np.uint8)
+    with pytest.raises(SceneError, match="image 005.png is not in the colours of opencv_inferno: .* jet fits"):
+        scene_of(images, palette=palette_reader())
 
 
 def test_grey_images_fill_three_channels():

@@ -2,9 +2,11 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from camera_files import flir_jpeg, palette_record, raw_for, temperatures
 from layouts import (
     BOUNDS,
     FOCAL,
@@ -21,6 +23,7 @@ from layouts import (
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model, read_model
+from heatsplat.datamodules.formats.palette import named
 
 M3T = Path(__file__).parents[3] / "shared" / "data" / "m3t_heath"
 needs_m3t = pytest.mark.skipif(not M3T.is_dir(), reason="real DJI data is not at ../shared/data/m3t_heath")
@@ -513,3 +516,25 @@ def test_a_table_of_places_is_found_however_excel_saved_it(tmp_path):
         assert loaded(tmp_path).positions == table
     table.write_bytes(b"\x81\x8d")
     assert loaded(tmp_path).positions is None
+
+
+def test_pictures_of_radiometric_files_have_temperatures_by_the_palette_in_them(tmp_path):
+    files = names(9, "frame_{:03d}.jpg")
+    write_colmap(tmp_path, files, images=None)
+    write_json(tmp_path / "temperature_bounds.json", BOUNDS)
+    luma_red_blue = np.array([[16, 101, 140], [71, 179, 179], [126, 198, 96], [181, 173, 33], [235, 121, 130]])
+    (tmp_path / "images").mkdir()
+    for i, name in enumerate(files):
+        shown = np.rint(named("iron").curve(256)[cv2.GaussianBlur(grey(i), (0, 0), 2)]).astype(np.uint8)
+        data = flir_jpeg(raw_for(temperatures(i)), shown, palette=palette_record(luma_red_blue))
+        (tmp_path / "images" / name).write_bytes(data)
+    with pytest.raises(
+        SceneError, match="data.palette=iron changes nothing for radiometric JPEGs such as frame_000.jpg"
+    ):
+        loaded(tmp_path, palette="iron")
+    scene = loaded(tmp_path, palette="embedded", radiometric="never")
+    assert "frame_000.jpg" in scene.notes["palette"] and scene.thermal_range.max_c == BOUNDS["absolute_max_temperature"]
+    view = scene.train[0]
+    known = torch.ones(HEIGHT, WIDTH, dtype=torch.bool) if view.mask is None else view.mask
+    error = 255 * view.thermal[..., 0] - torch.from_numpy(cv2.GaussianBlur(grey(1), (0, 0), 2))
+    assert known.float().mean() > 0.8 and error[known].abs().median() < 4

@@ -14,6 +14,7 @@ from plyfile import PlyData, PlyElement
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.nerfstudio import Transforms, lens_in, read_transforms
+from heatsplat.datamodules.formats.palette import named
 from heatsplat.datamodules.nerfstudio import Nerfstudio
 from heatsplat.datamodules.points import ply_points
 
@@ -91,6 +92,21 @@ def test_photos_alone_are_an_rgb_scene(tmp_path):
         view.image("thermal")
     colours = loaded(tmp_path, thermal_channels=3)
     assert colours.train[0].thermal.shape == (HEIGHT, WIDTH, 3) and colours.train[0].rgb is None
+
+
+def test_colours_of_a_palette_are_thermal_images(tmp_path):
+    for i, name in enumerate(names(9)):
+        colours = np.rint(named("iron").curve(256)[grey(i)]).astype(np.uint8)
+        write_image(tmp_path / "images" / name, colours)
+    write_frames(tmp_path, [{"file_path": f"images/{name}"} for name in names(9)])
+    assert loaded(tmp_path).train[0].thermal is None  # nothing says that they are
+    write_json(tmp_path / "temperature_bounds.json", {"absolute_min_temperature": 1, "absolute_max_temperature": 2})
+    for folder in (tmp_path, None):
+        if folder is None:
+            (tmp_path / "temperature_bounds.json").unlink()
+        scene = loaded(tmp_path, palette="iron")
+        np.testing.assert_allclose(255 * scene.train[0].thermal[..., 0], grey(1), atol=1.01)
+        assert (scene.thermal_range is None) == (folder is None)
 
 
 def test_colours_with_bounds_are_no_photos(tmp_path):

@@ -3,9 +3,10 @@
 import cv2
 import numpy as np
 import pytest
-from layouts import HEIGHT, WIDTH, grey, names, points, viewmats, write_colmap, write_image, write_json
+from layouts import BOUNDS, HEIGHT, WIDTH, grey, names, points, viewmats, write_colmap, write_image, write_json
 
 from heatsplat.contracts import SceneError
+from heatsplat.datamodules.formats.palette import named
 from heatsplat.datamodules.ntr import NTR
 from heatsplat.datamodules.rgbt_scenes import RGBTScenes
 from heatsplat.datamodules.ti_nsd import TINSD, frame_number
@@ -97,6 +98,26 @@ def test_rgbt_scenes_options(tmp_path):
     scene = loaded(RGBTScenes, tmp_path, thermal_channels=1, rgb=False, split="every_8th")
     assert scene.train[0].thermal.shape == (HEIGHT, WIDTH, 1) and scene.train[0].rgb is None
     assert "luma" in scene.notes["pseudo_colour"]
+
+
+def test_rgbt_scenes_have_temperatures_where_palette_and_bounds_are_known(tmp_path):
+    write_rgbt(tmp_path)
+    write_json(tmp_path / "temperature_bounds.json", BOUNDS)
+    scene = loaded(RGBTScenes, tmp_path, palette="opencv_inferno")
+    assert (scene.thermal_range.min_c, scene.thermal_range.max_c) == (10, 40)
+    np.testing.assert_allclose(255 * scene.train[0].thermal[..., 0], grey(1), atol=1.01)
+    assert scene.train[0].rgb.shape == (HEIGHT, WIDTH, 3)
+    colours = loaded(RGBTScenes, tmp_path)
+    assert colours.thermal_range is None and "bounds_ignored" in colours.notes
+    with pytest.raises(SceneError, match=r"img_00.\.jpg is not in the colours of jet: .*inferno fits"):
+        loaded(RGBTScenes, tmp_path, palette="jet")
+    with pytest.raises(SceneError, match="data.palette_hot=top says how a colour bar lies; give it as data.palette"):
+        loaded(RGBTScenes, tmp_path, palette_hot="top")
+    bar = np.repeat(named("opencv_inferno").curve(200)[::-1, None], 12, axis=1)
+    write_image(tmp_path / "bar.png", np.rint(bar).astype(np.uint8))
+    scene = loaded(RGBTScenes, tmp_path, palette="bar.png")
+    np.testing.assert_allclose(255 * scene.train[0].thermal[..., 0], grey(1), atol=2.5)
+    assert "bar.png" in scene.notes["palette"]
 
 
 def test_rgbt_scenes_skip_what_is_listed_but_not_there(tmp_path):

@@ -11,7 +11,9 @@ from PIL import Image
 from recordings import START, STATED, read_frames, write_flir, write_images, write_sequence
 
 from heatsplat.contracts import SceneError, as_written
+from heatsplat.datamodules.formats.palette import named
 from heatsplat.preparation import frames
+from heatsplat.preparation.fingerprint import fingerprint
 from heatsplat.preparation.frames import Reading, read_recording
 from heatsplat.preparation.meaning import Meaning
 
@@ -205,7 +207,7 @@ def test_folders_that_cannot_be_understood_are_refused_by_name(tmp_path):
     palette = cv2.applyColorMap((y * 16 + x), cv2.COLORMAP_INFERNO)
     with pytest.raises(
         SceneError,
-        match="coloured pictures alone .such as a.png.: colours of a palette.*Photos .*data.images=null data.rgb=FOLDER",
+        match="coloured pictures alone .such as a.png.: colours .*palette=iron bounds_c.*Photos .*data.images=null data.rgb=",
     ):
         read_frames(write_images(tmp_path / "colours", {"a.png": palette}))
     with pytest.raises(SceneError, match="several kinds.*floating-point images .*16-bit images .*folder of its own"):
@@ -217,6 +219,63 @@ def test_folders_that_cannot_be_understood_are_refused_by_name(tmp_path):
     (tmp_path / "broken" / "c.png").write_bytes(b"\x89PNG broken")
     with pytest.raises(SceneError, match=r"c\.png is corrupt"):
         read_frames(tmp_path / "broken")
+
+
+def coloured(levels, name="iron"):
+    """A picture of levels from 0 to 255, with the channels in OpenCV's order."""
+    return np.rint(named(name).curve(256)[levels]).astype(np.uint8)[..., ::-1]
+
+
+def test_pictures_in_false_colours_have_temperatures_by_palette_and_bounds(tmp_path):
+    levels = (FLOATS * 5).astype(np.uint8)
+    drawn = coloured(levels)
+    drawn[:3, :5] = (0, 255, 0)
+    bar = np.repeat(coloured(np.arange(256)[::-1, None]), 12, axis=1)
+    write_images(tmp_path, {"a.png": coloured(levels), "b.png": drawn, "bar.png": bar})
+    for palette, tolerance in (("iron", 0.21), ("bar.png", 0.5)):
+        (tmp_path / "bar.png").unlink() if palette == "iron" else cv2.imwrite(str(tmp_path / "bar.png"), bar)
+        a, b = read_frames(tmp_path, Reading(Meaning(bounds_c=[0.0, 51.0]), palette=palette))
+        np.testing.assert_allclose(a.temperature(), levels / 5.0, atol=tolerance)
+        assert np.isnan(b.temperature()[:3, :5]).all() and np.isfinite(b.temperature()[3:]).all()
+        notes = read_recording(tmp_path, Reading(Meaning(bounds_c=[0.0, 51.0]), palette=palette)).notes
+        assert any(note.startswith("levels by the palette") and palette in note for note in notes)
+    one, other = (
+        read_frames(tmp_path, Reading(Meaning(bounds_c=[0.0, 51.0]), palette=p))[0] for p in ("iron", "iron_r")
+    )
+    assert fingerprint(one) != fingerprint(other)
+
+
+def test_palettes_that_do_not_fit_the_files_are_refused(tmp_path):
+    levels = (FLOATS * 5).astype(np.uint8)
+    bounds = Meaning(bounds_c=[0.0, 51.0])
+    colours = write_images(tmp_path / "colours", {"a.png": coloured(levels)})
+    with pytest.raises(
+        SceneError, match=r"palette=iron tells levels from the colours of a.png .*: bounds_c=\[min,max\]"
+    ):
+        read_frames(colours, Reading(palette="iron"))
+    with pytest.raises(SceneError, match=r"a.png is not in the colours of jet: .*\(palette=bar.png"):
+        read_frames(colours, Reading(bounds, palette="jet"))[0].load()
+    found = read_recording(
+        write_images(tmp_path / "like", {"a.png": coloured(np.tile(np.arange(20, 236, dtype=np.uint8), (30, 1)))}),
+        Reading(bounds, palette="inferno"),
+    )
+    assert any("the images fit the palette iron much better" in note for note in found.notes)
+    with pytest.raises(SceneError, match="palette=irn is no palette .did you mean iron"):
+        read_frames(colours, Reading(bounds, palette="irn"))
+    with pytest.raises(SceneError, match="palette_hot=top is for the picture of a colour bar"):
+        read_frames(colours, Reading(bounds, palette="iron", palette_hot="top"))
+    with pytest.raises(SceneError, match="palette_hot=top says how a colour bar lies; give it as palette"):
+        Reading(palette_hot="top")
+    for name, pixels, what in (
+        ("a.png", levels, "8-bit greys"),
+        ("a.png", (FLOATS * 100 + 27315).astype(np.uint16), "16-bit images"),
+        ("a.tiff", FLOATS, "floating-point images"),
+    ):
+        folder = write_images(tmp_path / what.replace(" ", "_"), {name: pixels, "b.png": coloured(levels)})
+        with pytest.raises(
+            SceneError, match=f"palette=iron is for pictures in false colours, and .* holds {what} .such as {name}"
+        ):
+            read_frames(folder, Reading(bounds, palette="iron"))
 
 
 def test_pictures_of_dji_without_temperatures_are_refused_with_what_to_run_unless_bounds_are_given(tmp_path):

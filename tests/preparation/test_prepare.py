@@ -3,6 +3,7 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from camera_files import temperatures
@@ -14,6 +15,7 @@ from benchmarks.camera_folder import Field, write_camera
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import read_model, write_model
+from heatsplat.datamodules.formats.palette import named
 from heatsplat.datamodules.synthetic_scene.film import Size, film
 from heatsplat.datamodules.synthetic_scene.presets import PRESETS
 from heatsplat.datamodules.synthetic_scene.scene import Scene
@@ -87,6 +89,29 @@ def test_a_folder_of_camera_files_becomes_a_scene_that_loads_with_temperatures_a
     view = next(view for view in views if view.frame.name == f"{frame.name}.tiff")
     shown = module.scene.thermal_range.to_celsius(view.thermal[..., 0])
     np.testing.assert_allclose(shown, frame.temperature(), atol=2e-3)
+
+
+def test_pictures_in_false_colours_become_temperatures_between_bounds(tmp_path):
+    source = tmp_path / "source"
+    source.mkdir()
+    levels = np.clip(8 * temperatures(), 0, 255).astype(np.uint8)
+    colours = np.rint(named("iron").curve(256)[levels]).astype(np.uint8)
+    colours[:4, :6] = (0, 255, 0)
+    for i in range(3):
+        cv2.imwrite(str(source / f"f{i}.png"), colours[..., ::-1])
+    page = prepare(str(source), tmp_path / "scene", **PLAIN, bounds_c=[0.0, 51.0], palette="iron")
+    celsius = cv2.imread(str(tmp_path / "scene" / "images" / "f1.tiff"), cv2.IMREAD_UNCHANGED)
+    assert celsius.dtype == np.float32 and np.isnan(celsius[:4, :6]).all()
+    np.testing.assert_allclose(celsius[4:], levels[4:] / 5.0, atol=0.21)
+    record = json.loads((tmp_path / "scene" / "images" / "f1.json").read_text())
+    assert record["unknown_pixels"] == 24
+    assert "levels by the palette iron" in page.with_suffix(".md").read_text()
+    before = (tmp_path / "scene" / "images" / "f1.tiff").stat().st_mtime_ns
+    prepare(str(source), tmp_path / "scene", **PLAIN, bounds_c=[0.0, 51.0], palette="iron")
+    assert (tmp_path / "scene" / "images" / "f1.tiff").stat().st_mtime_ns == before
+    prepare(str(source), tmp_path / "scene", **PLAIN, bounds_c=[0.0, 51.0], palette="iron_r")
+    turned = cv2.imread(str(tmp_path / "scene" / "images" / "f1.tiff"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_allclose(turned[4:], 51 - levels[4:] / 5.0, atol=0.21)
 
 
 def test_conditions_that_are_given_change_the_temperatures(tmp_path):
