@@ -107,7 +107,9 @@ def test_what_makes_no_mesh_is_said(cooling, tmp_path, monkeypatch, caplog):
         SceneError, match=r"no training view shows a surface to make a mesh of: train longer, or give what.mesh"
     ):
         Mesh(views=3).write(clear, tmp_path / "a.ply")
-    with pytest.raises(SceneError, match=r"no surface is found with voxels of .* give a larger what.truncation"):
+    with pytest.raises(
+        SceneError, match=r"no surface is found with voxels of .* Give a coarser what.voxel or a larger what.truncation"
+    ):
         Mesh(views=3, voxel=0.001 * radius).write(ball, tmp_path / "a.ply")
     monkeypatch.setattr(made_surface, "MOST", 40_000)
     with pytest.raises(SceneError, match=r"what.voxel=.* fits, or a part of the scene \(box\)"):

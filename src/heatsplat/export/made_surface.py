@@ -117,7 +117,8 @@ def made_surface(
     if not len(kept.faces):
         raise SceneError(
             f"no surface is found with voxels of {size:.3g}: {'none lies in the box, or ' if box is not None else ''}what views "
-            f"show is spread over more than {reach:.3g} along their rays. Train longer, or give a larger what.truncation"
+            f"show is spread over more than {reach:.3g} along their rays. Give a coarser what.voxel or a larger "
+            f"what.truncation, or train longer; without what.voxel it is {VOXEL * width:.3g}"
         )
     log.info(
         "mesh of %d triangles from %s; voxels are %.3g wide, a pixel on the surface %.3g (median); %d triangles of pieces below "
