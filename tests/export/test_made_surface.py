@@ -146,7 +146,7 @@ def test_options_that_are_none_are_refused(options, message):
 
 
 def test_the_mesh_of_a_run_lies_on_the_true_surfaces(tmp_path):
-    """As they do after 150 steps, to 0.011 of the scene's size; depths that are 3 % off would be noticed."""
+    """As they do after 150 steps, to 0.011 of its size, a little before them; depths 3 % too small or 6 % too large fail."""
     from datamodules.synthetic_scene.presets import PRESETS
     from datamodules.synthetic_scene.shapes import nearest_surface
 
@@ -158,5 +158,5 @@ def test_the_mesh_of_a_run_lies_on_the_true_surfaces(tmp_path):
     on, _ = nearest_surface([surface.shape for surface in PRESETS["static"].surfaces], points)
     errors = (on - points).norm(dim=1)
     size = float(run.module.scene.bulk[1])
-    assert len(faces) > 500 and errors.median() < 0.02 * size and errors.quantile(0.9) < 0.05 * size
+    assert len(faces) > 500 and errors.median() < 0.015 * size and errors.quantile(0.9) < 0.04 * size
     assert np.isfinite(vertices["temperature_c"]).mean() > 0.8
