@@ -454,7 +454,8 @@ def export(config: dict[str, Any], output_dir: Path) -> None:
     box, form = checked_box("box", config["box"]), build(config["what"])
     if box is not None and not form.of_gaussians:
         raise SceneError(
-            "box cuts Gaussians out for what=gltf, las, npz, ply and spz: a map has what.bounds, and a mesh is yours to cut"
+            "box cuts out of what=gltf, las, npz, ply and spz, and of a mesh that is made: a map has what.bounds, and a mesh of "
+            "your own (what.mesh) is yours to cut"
         )
     trained = _load(config, output_dir)
     for path in write_files(trained.module, form, output_dir, config["time"], config["layer"], box):

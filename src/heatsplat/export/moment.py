@@ -29,6 +29,7 @@ class Moment:
         values: [N] the same in the unit of the scene: °C, or image values where these are no temperatures.
         module: the training module, for formats that render.
         whole: the moment that these Gaussians were cut out of, which is what cameras see; None of all of them.
+        box: [2, 3] float64 corners of where they were cut out, in the coordinates of the data set; None of all of them.
     """
 
     seen: Snapshot
@@ -38,6 +39,7 @@ class Moment:
     values: Tensor
     module: Any
     whole: Moment | None = None
+    box: Tensor | None = None
 
     @property
     def quantity(self) -> str:
@@ -102,7 +104,7 @@ def inside(moment: Moment, box: Tensor) -> Moment:
         )
     cut = {"seen": moment.seen.of(kept), "blended": moment.blended[kept], "values": moment.values[kept]}
     layer = next(one for one in cut["seen"].layers if one.name == moment.layer.name)
-    return replace(moment, layer=layer, whole=moment, **cut)
+    return replace(moment, layer=layer, whole=moment, box=box, **cut)
 
 
 def moments_in(scene: SceneData, span: tuple[float, float] | None, times: Times | None) -> list[float | None]:

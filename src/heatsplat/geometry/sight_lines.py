@@ -38,14 +38,28 @@ def cosines(camera: Camera, depth: Tensor) -> Tensor:
 def normals(camera: Camera, depth: Tensor) -> Tensor:
     """Normals [H, W, 3] of length 1 in the camera's frame, away from it, float64; NaN where they are not known.
 
-    One over the depth is linear over the image of a plane, 1/z = n r for the plane n x = 1 and the ray r of a pixel; so the
-    normal n is fitted to it by least squares over a window. Where the window has an edge or an open pixel it is not known.
+    Those of ``planes`` over windows as large as depth maps of Gaussians are rough.
 
     Args:
         depth: [H, W] camera z, infinite where there is no surface.
     """
+    found = planes(camera, depth, max(LEAST, min(depth.shape) // REACH), BREAK)
+    return found / found.norm(dim=-1, keepdim=True)
+
+
+def planes(camera: Camera, depth: Tensor, reach: int, flat: float) -> Tensor:
+    """The planes n x = 1 that a depth map is made of, n [H, W, 3] in the camera's frame, away from it, float64; NaN where there
+    is none.
+
+    One over the depth is linear over the image of a plane, 1/z = n r for the ray r of a pixel; so n is fitted to it by least
+    squares over a window. Where the window has an edge or an open pixel, or leaves the image, there is no plane.
+
+    Args:
+        depth: [H, W] camera z, infinite where there is no surface.
+        reach: pixels of the window to either side.
+        flat: of 1 / depth, root mean square from the plane, above which a window has an edge in it.
+    """
     found = torch.full((*depth.shape, 3), torch.nan, dtype=torch.float64)
-    reach = max(LEAST, min(depth.shape) // REACH)
     if min(depth.shape) <= 2 * reach:
         return found
     steps = torch.arange(-reach, reach + 1, dtype=torch.float64)
@@ -69,6 +83,6 @@ def normals(camera: Camera, depth: Tensor) -> Tensor:
     normal = torch.stack([right * camera.K[0, 0], down * camera.K[1, 1], mean], dim=-1).double()
     normal[..., 2] -= (normal[..., :2] * sight[..., :2]).sum(-1)
     whole = sums(inverse.gt(0).double(), ones, ones) > count - 0.5
-    known = whole & (rest.clamp(min=0.0).sqrt() < BREAK * mean)
-    found[inner] = (normal / normal.norm(dim=-1, keepdim=True)).where(known[..., None], torch.nan)
+    known = whole & (rest.clamp(min=0.0).sqrt() < flat * mean)
+    found[inner] = normal.where(known[..., None], torch.nan)
     return found

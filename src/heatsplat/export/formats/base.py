@@ -26,7 +26,7 @@ class Format(ABC):
         suffix: of its files, with the dot.
         from_origin: whether coordinates are the scene's own, which count from its "origin" where one was taken off numbers
             that float32 cannot hold (``notes["origin"]``).
-        of_gaussians: whether it holds the Gaussians one by one, so that a box can cut some out.
+        of_gaussians: whether it is made of the Gaussians in such a way that a box can cut some out.
     """
 
     suffix: str = ""

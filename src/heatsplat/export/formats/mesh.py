@@ -1,42 +1,48 @@
-"""A mesh that is given, with the temperature of its vertices."""
+"""A mesh, given or made of the splats, with the temperature of its vertices."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from plyfile import PlyData, PlyElement
+from torch import Tensor
 
-from heatsplat.contracts import SceneError, check_count, evenly_spread
+from heatsplat.contracts import SceneData, SceneError, check_count, check_numbers, evenly_spread
 from heatsplat.export.formats.base import Format, checked_range, optional
+from heatsplat.export.made_surface import made_surface
+from heatsplat.export.mesh_picture import pictured
 from heatsplat.export.moment import Moment
 from heatsplat.geometry.coverage import DEPTH_TOLERANCE
+from heatsplat.geometry.fusion import Surface
 from heatsplat.geometry.looks import values_at
-from heatsplat.io.pictures import checked_colormap, colorize
+from heatsplat.io.pictures import IMAGE_VALUES, Bar, checked_colormap, colorize, write_png
 
 log = logging.getLogger("heatsplat")
 
 
 class Mesh(Format):
-    """PLY of a mesh in the coordinates of the scene, with °C and a colour at each vertex.
+    """PLY of a mesh in the coordinates of the data set, with °C and a colour at each vertex; a picture (.png) lies beside it.
 
     A vertex has the mean of the training views that see it: it lies in their image where that counts, before it stands nothing
     of the scene, and its outward normal points towards them. Those that no view sees have NaN, and grey.
 
     Args:
-        mesh: file that trimesh reads (PLY, OBJ, STL, GLB ...).
+        mesh: file that trimesh reads (PLY, OBJ, STL, GLB ...); None makes a mesh of what the splats show the training views
+            (``export.made_surface``).
         views: training views that are asked, spread evenly; None takes all.
         colormap: name of a matplotlib map.
         range_c: °C at the ends of the map; None takes the scene's range.
-        two_sided: normals are not to be trusted: every camera is before every face.
+        two_sided: normals are not to be trusted: every camera is before every face. Of a mesh that is given.
+        voxel, truncation, least_piece: as of ``export.made_surface.made_surface``, of a mesh that is made.
     """
 
     suffix = ".ply"
     from_origin = False
-    of_gaussians = False
 
     def __init__(
         self,
@@ -45,18 +51,60 @@ class Mesh(Format):
         colormap: str = "inferno",
         range_c: Sequence[float] | None = None,
         two_sided: bool = False,
+        voxel: float | None = None,
+        truncation: float = 4.0,
+        least_piece: float = 0.001,
     ) -> None:
-        if mesh is None:
-            raise SceneError(
-                "which mesh? Give what.mesh=FILE, in the coordinates of the scene. Programs such as OpenMVS or Metashape make "
-                "one of the same images and cameras, Open3D or MeshLab one of the points of what=las (Poisson)"
-            )
         if views is not None:
             check_count("what.views", views)
-        self.mesh, self.views, self.two_sided = Path(mesh).expanduser(), views, two_sided
+        if voxel is not None:
+            check_numbers("what.voxel", voxel, error=SceneError, above=0)
+        check_numbers("what.truncation", truncation, error=SceneError)
+        check_numbers("what.least_piece", least_piece, error=SceneError)
+        if truncation < 2:
+            raise SceneError(f"what.truncation must be 2 voxels or more, got {truncation:g}")
+        if not 0 <= least_piece <= 1:
+            raise SceneError(f"what.least_piece must be a share of the area, from 0 to 1, got {least_piece:g}")
+        if mesh is None and two_sided:
+            raise SceneError(
+                "what.two_sided=true is for a mesh that you give (what.mesh=FILE): one that is made has outward normals"
+            )
+        if mesh is not None and voxel is not None:
+            raise SceneError("what.voxel is for a mesh that is made: leave out what.mesh, or what.voxel")
+        self.mesh, self.views, self.two_sided = None if mesh is None else Path(mesh).expanduser(), views, two_sided
+        self.voxel, self.truncation, self.least_piece = voxel, truncation, least_piece
         self.colormap, self.range_c = checked_colormap("what.colormap", colormap), checked_range(range_c)
+        self.of_gaussians = mesh is None
 
     def write(self, moment: Moment, path: Path) -> None:
+        scene = moment.module.scene
+        views = [scene.train[i] for i in evenly_spread(len(scene.train), self.views or len(scene.train))]
+        if self.mesh is None:
+            surface, depths = made_surface(moment, views, self.voxel, self.truncation, self.least_piece)
+            normals = surface.normals()
+            looks = [replace(moment.look(view), depth=depth) for view, depth in zip(views, depths, strict=True)]
+        else:
+            surface, normals = self._given(scene)
+            looks = [moment.look(view) for view in views]
+        values = values_at(looks, surface.vertices, None if self.two_sided else normals)
+        self._say_seen(values, len(looks))
+        low, high = self.range_c or moment.seen.limits
+        colours = colorize(values[:, None], low, high, self.colormap)[:, 0]
+        name = f"{moment.quantity}_c" if moment.seen.unit else moment.quantity
+        kinds = [(axis, "f8") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")] + [(name, "f4")]
+        vertices = np.empty(len(values), dtype=kinds)
+        places = surface.vertices + scene.origin
+        for column, content in zip(vertices.dtype.names, (*places.T, *colours.T, values), strict=True):
+            vertices[column] = content
+        faces = np.empty(len(surface.faces), dtype=[("vertex_indices", "i4", (3,))])
+        faces["vertex_indices"] = surface.faces
+        elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+        PlyData(elements, byte_order="<").write(str(path))
+        bar = Bar(low, high, moment.seen.unit or IMAGE_VALUES, colormap=self.colormap)
+        write_png(path.with_suffix(".png"), pictured(surface, values, scene, bar))
+
+    def _given(self, scene: SceneData) -> tuple[Surface, Tensor]:
+        """The mesh that is given, in the world, and normals [V, 3]. Raises SceneError where it cannot be read."""
         trimesh = optional("trimesh", "mesh")
         try:
             given = trimesh.load(str(self.mesh), force="mesh", process=False)
@@ -67,31 +115,25 @@ class Mesh(Format):
                 f"what.mesh={self.mesh} has no faces: a mesh is made of triangles. For points with temperatures of their own see "
                 "what=las"
             )
-        points, normals = (torch.from_numpy(np.array(part)) for part in (given.vertices, given.vertex_normals))
-        scene = moment.module.scene
-        chosen = evenly_spread(len(scene.train), len(scene.train) if self.views is None else self.views)
-        looks = [moment.look(scene.train[i]) for i in chosen]
-        values = values_at(looks, points - scene.origin, None if self.two_sided else normals)
-        if not values.isfinite().any():
+        points, normals, faces = (
+            torch.from_numpy(np.array(part)) for part in (given.vertices, given.vertex_normals, given.faces)
+        )
+        return Surface(points.double() - scene.origin, faces.long()), normals
+
+    def _say_seen(self, values: Tensor, views: int) -> None:
+        """Logs how many vertices have a value. Raises SceneError where none has."""
+        count, of = int(values.isfinite().sum()), f"what.mesh={self.mesh}: " if self.mesh else ""
+        if not count:
             raise SceneError(
-                f"what.mesh={self.mesh}: no training view sees any of its {len(points)} vertices. Is it in the coordinates of "
-                "the scene, and do its normals point outward (what.two_sided=true takes them as they are)?"
+                f"{of}no training view sees any of its {len(values)} vertices. Is it in the coordinates of the scene, and do its "
+                "normals point outward (what.two_sided=true takes them as they are)?"
+                if self.mesh
+                else "the images of the training views count nowhere on the mesh (their masks leave it out)"
             )
-        count = int(values.isfinite().sum())
-        log.info("%d of %d vertices are seen by %d views", count, len(points), len(looks))
-        if count < len(points) / 2:
+        log.info("%d of %d vertices are seen by %d views", count, len(values), views)
+        if count < len(values) / 2:
             log.warning(
-                "what.mesh=%s: most vertices have no temperature, as no view has them within %.0f %% of the distance at which "
-                "the splats show a surface%s", self.mesh, 100 * DEPTH_TOLERANCE,
-                "" if self.two_sided else ", on the side of their normals (what.two_sided=true takes both)",
+                "%smost vertices have no temperature, as no view has them within %.0f %% of the distance at which "
+                "the splats show a surface%s", of, 100 * DEPTH_TOLERANCE,
+                "" if self.two_sided or not self.mesh else ", on the side of their normals (what.two_sided=true takes both)",
             )  # fmt: skip
-        colours = colorize(values[:, None], *(self.range_c or moment.seen.limits), self.colormap)[:, 0]
-        name = f"{moment.quantity}_c" if moment.seen.unit else moment.quantity
-        kinds = [(axis, "f8") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")] + [(name, "f4")]
-        vertices = np.empty(len(points), dtype=kinds)
-        for column, content in zip(vertices.dtype.names, (*points.T, *colours.T, values), strict=True):
-            vertices[column] = content
-        faces = np.empty(len(given.faces), dtype=[("vertex_indices", "i4", (3,))])
-        faces["vertex_indices"] = given.faces
-        elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-        PlyData(elements, byte_order="<").write(str(path))
