@@ -305,9 +305,7 @@ def colour_levels(pixels: np.ndarray) -> float:
     if pixels.ndim == 2:
         return 0.0
     full = 255.0 / np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
-    r, g, b = (
-        pixels[..., channel] for channel in range(3)
-    )  # by channel: reducing an axis of three is five times slower
+    r, g, b = (pixels[..., channel] for channel in range(3))  # reducing an axis of three is five times slower
     largest, least = np.maximum(np.maximum(r, g), b), np.minimum(np.minimum(r, g), b)
     return float((largest.astype(np.float64) - least).mean() * full)
 

@@ -32,9 +32,8 @@ IRON = np.array([[16.0, 219.0, 0.0, 0.0], [-27.4, 451.6, -594.8, 163.3], [11.6, 
 PERCEIVED = np.array([[0.299, 0.587, 0.114], [-0.0591, -0.1159, 0.175], [0.175, -0.1465, -0.0285]]).T
 
 MIN_BAR_PX = 16  # along a bar, fewer do not show its palette
-MOST_UNEVEN = (
-    12.0  # mean difference of the colours across a bar, in units of PERCEIVED; a picture of a scene has 20 and more
-)
+# Mean difference of the colours across a bar, in units of PERCEIVED; a picture of a scene has 20 and more.
+MOST_UNEVEN = 12.0
 BAR_NOISE = 1.5  # in those units: colours along a bar that differ by less are one
 FRAME_SHARE, FRAME_STEP = 0.04, 12.0  # of a bar's ends that may be its frame, told by such a step
 
