@@ -27,9 +27,8 @@ AROUND = 1  # pixels to either side of the one whose plane they tell
 FLAT = 0.01  # of 1 / depth, root mean square from that plane: a step of 4 % across the window bends more
 STEEPEST = 0.17  # cosine of the line of sight to the normal (80 degrees) below which a pixel shows an edge, or a surface's side
 COARSEST = 4.0  # voxels that a pixel may be wide on the surface: what is farther away is seen by too few
-OFF_ZERO = (
-    1e-3  # of the truncation, least distance of a voxel: a vertex on a corner of the grid would lie on several edges
-)
+# Of the truncation, the least distance of a voxel: a vertex on a corner of the grid would lie on several edges.
+OFF_ZERO = 1e-3
 AT_ONCE = 2**11  # blocks that are looked at together
 BITS, ORIGIN = 21, 2**20  # of a block's place along an axis, in a number of 63 bits
 
