@@ -165,8 +165,8 @@ linear ones where frames are few, and full ones follow points of many frames thr
 one rate, with a core, and of infinite depth.
 
 - Sun, sky and wind count from a gain of two standard errors on: a part that is absent loses on held-out observations. Of 91
-  that 200 random scenes have, linear balances alone found 70 and missed 10; with full ones 80 are found and two missed, and two
-  are found that are not there (one before). On 100 scenes that nobody had looked at, 34 of 42 are found, three are missed, and
+  that 200 random scenes have, linear balances alone found 70 and missed 10; with full ones 82 are found and one missed, and two
+  are found that are not there (one before). On 100 scenes that nobody had looked at, 21 of 24 are found, one is missed, and
   none is wrongly found.
 - In few frames a part that is there may gain nothing. Sun and sky are absent only if bodies also take a share below the least
   that counts: 0.02 at most on nine random scenes without, 0.11 on one of nine frames whose sunlight gains nothing. What gains
@@ -176,9 +176,9 @@ one rate, with a core, and of infinite depth.
   general. Points follow these to 0.3 to 1.3 expected errors on 47 of 48 random scenes with frames enough. What all balances may
   miss together is no drift: beside what balances can make of it themselves, offsets are 0.2 K at most in five recordings without
   a drifting sensor, and 0.45 K and more in six with one; they count from 0.3 K on. Where
-  balances could say nearly all of what the camera adds themselves (all but 0.04 of the squares), they keep it: on one of 21
-  scenes a pattern had grown to 80 K, and the warmth of all points left with it. Of verdicts on the 45 outdoor scenes among 200
-  random ones 91.1 % are right, where 81.8 % were beside answers in general, and 0.9 % are wrong (1.4 % before).
+  balances could say nearly all of what the camera adds (all but 0.04 of the squares), they keep what they can say: a pattern had
+  grown to 80 and 18 K on two of 81 random scenes, and the warmth of all points left with it. Of verdicts on the 45 outdoor
+  scenes among 200 random ones 91.1 % are right, where 81.8 % were beside answers in general, and 0.9 % are wrong (1.4 % before).
 - Where frames are too few for that, or points do not follow balances, the camera is judged beside answers in general. Errors of
   a record pass for vignetting there, and hide it: on five of 18 random scenes with it, none was found. What changes with
   the distance from the middle by a tenth of the noise, and is no clear falloff, is therefore in doubt, as is more than a tenth

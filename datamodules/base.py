@@ -90,8 +90,9 @@ class SceneDataModule(pl.LightningDataModule, ABC):
         self.degrade, self.upsample = degrade, upsample
         self.scene_name = scene
         self.downscale = downscale
-        folder = Path(root).expanduser() / (scene or "") if root else None
-        self.split = SplitRule(split, split_fraction, split_position, split_file or None, folder)
+        # Where files that settings name are looked for first; None where the data set has no folder.
+        self._folder = Path(root).expanduser() / (scene or "") if root else None
+        self.split = SplitRule(split, split_fraction, split_position, split_file or None, self._folder)
         self.every = every
         self.seed = seed
         self.thermal_channels = thermal_channels
@@ -229,8 +230,7 @@ class SceneDataModule(pl.LightningDataModule, ABC):
                     f"data.palette_hot={self.palette_hot} says how a colour bar lies; give it as data.palette"
                 )
             return None
-        folder = Path(self.root).expanduser() / (self.scene_name or "") if self.root else None
-        return PaletteReader(palette_of(str(self.palette), self.palette_hot, folder))
+        return PaletteReader(palette_of(str(self.palette), self.palette_hot, self._folder))
 
 
 def _read_mask(path: Path, white_counts: bool) -> np.ndarray:

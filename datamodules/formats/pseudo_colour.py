@@ -251,8 +251,7 @@ class PaletteReader:
     def _places(self, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of colours [n, 3] the nearest level (0 .. 255), 1 + its distance * PER_UNIT (1 .. 255), and both of the nearest one
         that is far from that along the curve."""
-        squares = (self._curve**2).sum(axis=1) - 2.0 * colours @ self._curve.T
-        squares += (colours**2).sum(axis=1)[:, None]
+        squares = _squares(colours, self._curve)
         blocks = squares.reshape(len(colours), -1, BLOCK)
         least = blocks.min(axis=2)
         rows = np.arange(len(colours))
@@ -293,8 +292,14 @@ def _misfit(colours: np.ndarray, curve: np.ndarray) -> float:
     """Mean distance of colours [n, 3] from a curve, of which more than OFF counts as OFF; 0 of none."""
     if not len(colours):
         return 0.0
-    squares = (curve**2).sum(axis=1) - 2.0 * colours @ curve.T + (colours**2).sum(axis=1)[:, None]
-    return float(np.sqrt(np.clip(squares.min(axis=1), 0.0, OFF**2)).mean())
+    return float(np.sqrt(np.clip(_squares(colours, curve).min(axis=1), 0.0, OFF**2)).mean())
+
+
+def _squares(colours: np.ndarray, curve: np.ndarray) -> np.ndarray:
+    """Squared distances [n, N] of colours [n, 3] from samples [N, 3] of a curve; rounding may leave them below 0."""
+    squares = (curve**2).sum(axis=1) - 2.0 * colours @ curve.T
+    squares += (colours**2).sum(axis=1)[:, None]
+    return squares
 
 
 def _ranges(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -318,8 +323,7 @@ def _fitting(pixels: np.ndarray) -> str:
     best, least = "", MOST_MEDIAN / 2
     for palette in known():
         curve = palette.curve(128) @ PERCEIVED
-        squares = (curve**2).sum(axis=1) - 2.0 * some @ curve.T + (some**2).sum(axis=1)[:, None]
-        distance = float(np.sqrt(np.maximum(np.median(squares.min(axis=1)), 0.0)))
+        distance = float(np.sqrt(np.maximum(np.median(_squares(some, curve).min(axis=1)), 0.0)))
         if distance < least:
             best, least = palette.name, distance
     return f"{best} fits ({least:.1f}; {best}_r if its cold end is the other one). " if best else ""
