@@ -17,6 +17,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -53,6 +54,24 @@ def is_metashape(path: Path) -> bool:
         return False
 
 
+@dataclass
+class _Listed:
+    """The cameras that a chunk lists, by label: element and camera-to-chunk pose of those that are aligned, and why others are
+    left out or refused."""
+
+    elements: dict[str, ElementTree.Element] = field(default_factory=dict)
+    poses: dict[str, np.ndarray] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)
+
+    def leave_out(self, name: str, why: str) -> None:
+        del self.poses[name]
+        self.left_out[name] = why
+
+    def sensor(self, name: str) -> str | None:
+        return self.elements[name].get("sensor_id")
+
+
 def read_metashape(path: Path) -> AlignedCameras:
     """The cameras of a cameras.xml: in metres east, north and up of the first one where the chunk is georeferenced, else in the
     local coordinates of its reference, else in those of the chunk.
@@ -61,57 +80,18 @@ def read_metashape(path: Path) -> AlignedCameras:
         SceneError: the file is none, or one of its numbers cannot be; it names file, key and remedy.
     """
     chunk = _chunk(path)
-    transforms = {one.get("id"): _transform(one.find("transform"), f"{path}: transform of component {one.get('id')}")
-                  for one in chunk.iterfind("components/component")}  # fmt: skip
-    of_chunk = _transform(chunk.find("transform"), f"{path}: transform of the chunk")
-    left_out: dict[str, str] = {}
-    poses: dict[str, np.ndarray] = {}
-    of: dict[str, ElementTree.Element] = {}
-    twice: dict[str, str] = {}
-    for camera in chunk.iterfind("cameras//camera"):
-        name, matrix = camera.get("label"), camera.find("transform")
-        if not name:
-            raise SceneError(f"{path}: camera {camera.get('id')} has no label, the name of its image; {EXPORT}")
-        if name in of:
-            twice[name] = (
-                f"{path}: two cameras have the label {name!r}, and nothing tells whose camera is whose; rename one in Metashape, "
-                "or export each flight from a chunk of its own"
-            )
-        of[name] = camera
-        if camera.get("enabled", "true").lower() in ("false", "0"):
-            left_out[name] = "it is disabled in Metashape"
-        elif matrix is None:
-            left_out[name] = _unaligned(camera)
-        else:
-            where = f"{path}: transform of camera {name}"
-            poses[name] = checked_pose(numbers_in(matrix.text, 16, where, EXPORT).reshape(4, 4), where)
-    for name in twice:
-        poses.pop(name, None)
-        left_out.pop(name, None)
-    if not poses and twice:
-        raise SceneError(next(iter(twice.values())))
-    component_of = {name: of[name].get("component_id") for name in poses}
-    used = {name: transforms.get(component) or of_chunk for name, component in component_of.items()}
-    if None in used.values() and len(set(component_of.values())) > 1:  # components in coordinates of their own
-        largest = Counter(component_of.values()).most_common(1)[0][0]
-        for name, component in component_of.items():
-            if component != largest:
-                left_out[name] = f"it belongs to component {component}, which nothing connects to component {largest}"
-                del poses[name], used[name]
-    if not poses:
-        raise SceneError(
-            f"{path}: none of its {len(left_out)} cameras is aligned and enabled; align them in Metashape first"
-        )
-    lenses, unread, notes = _lenses(path, chunk, {of[name].get("sensor_id") for name in poses})
-    rotations, centers = _in_reference(poses, used)
+    listed = _listed(path, chunk)
+    used = _transforms_of(path, chunk, listed)
+    lenses, unread, notes = _lenses(path, chunk, {listed.sensor(name) for name in listed.poses})
+    rotations, centers = _in_reference(listed.poses, used)
     world = _World(chunk.findtext("reference") or "", next(iter(used.values())), centers)
     axes, zero, origin = np.eye(3), np.zeros(3), None
     if world.on_earth:
         origin, zero = from_geocentric(centers[:1])[0], centers[0]
         axes = east_north_up_axes(origin)
-    cameras, refused = {}, twice
-    for name, rotation, center in zip(poses, rotations, centers, strict=True):
-        sensor = of[name].get("sensor_id")
+    cameras, refused = {}, listed.refused
+    for name, rotation, center in zip(listed.poses, rotations, centers, strict=True):
+        sensor = listed.sensor(name)
         if sensor in lenses:
             viewmat = world_to_camera(axes @ rotation, axes @ (center - zero), f"{path}: transform of camera {name}")
             cameras[name] = viewmat, lenses[sensor]
@@ -120,13 +100,66 @@ def read_metashape(path: Path) -> AlignedCameras:
     return AlignedCameras(
         source=path,
         cameras=cameras,
-        left_out=left_out,
+        left_out=listed.left_out,
         refused=refused,
         notes=[*notes, world.says],
         metres_per_unit=world.metres_per_unit,
         east_north_up=world.on_earth,
         origin=origin if world.ellipsoid is None else None,
     )
+
+
+def _listed(path: Path, chunk: ElementTree.Element) -> _Listed:
+    """The cameras of a chunk. Raises SceneError where none is left because of labels that two of them have."""
+    found = _Listed()
+    for camera in chunk.iterfind("cameras//camera"):
+        name, matrix = camera.get("label"), camera.find("transform")
+        if not name:
+            raise SceneError(f"{path}: camera {camera.get('id')} has no label, the name of its image; {EXPORT}")
+        if name in found.elements:
+            found.refused[name] = (
+                f"{path}: two cameras have the label {name!r}, and nothing tells whose camera is whose; rename one in Metashape, "
+                "or export each flight from a chunk of its own"
+            )
+        found.elements[name] = camera
+        if camera.get("enabled", "true").lower() in ("false", "0"):
+            found.left_out[name] = "it is disabled in Metashape"
+        elif matrix is None:
+            found.left_out[name] = _unaligned(camera)
+        else:
+            where = f"{path}: transform of camera {name}"
+            found.poses[name] = checked_pose(numbers_in(matrix.text, 16, where, EXPORT).reshape(4, 4), where)
+    for name in found.refused:
+        found.poses.pop(name, None)
+        found.left_out.pop(name, None)
+    if not found.poses and found.refused:
+        raise SceneError(next(iter(found.refused.values())))
+    return found
+
+
+def _transforms_of(path: Path, chunk: ElementTree.Element, listed: _Listed) -> dict[str, Transform | None]:
+    """What leads each aligned camera from chunk coordinates to those of the reference, by label.
+
+    Of components that nothing connects, only the largest keeps its cameras. Raises SceneError where none is left.
+    """
+    of_components = {one.get("id"): _transform(one.find("transform"), f"{path}: transform of component {one.get('id')}")
+                     for one in chunk.iterfind("components/component")}  # fmt: skip
+    of_chunk = _transform(chunk.find("transform"), f"{path}: transform of the chunk")
+    component_of = {name: listed.elements[name].get("component_id") for name in listed.poses}
+    used = {name: of_components.get(component) or of_chunk for name, component in component_of.items()}
+    if None in used.values() and len(set(component_of.values())) > 1:  # components in coordinates of their own
+        largest = Counter(component_of.values()).most_common(1)[0][0]
+        for name, component in component_of.items():
+            if component != largest:
+                listed.leave_out(
+                    name, f"it belongs to component {component}, which nothing connects to component {largest}"
+                )
+                del used[name]
+    if not listed.poses:
+        raise SceneError(
+            f"{path}: none of its {len(listed.left_out)} cameras is aligned and enabled; align them in Metashape first"
+        )
+    return used
 
 
 def _chunk(path: Path) -> ElementTree.Element:
