@@ -47,7 +47,7 @@ from heatsplat.physics.units import KELVIN_AT_0_C
 from heatsplat.preparation.conditions import GivenConditions
 from heatsplat.preparation.frame import Attitude, Position
 from heatsplat.preparation.report import Section, write_report
-from heatsplat.preparation.target import CORRECTED, Target
+from heatsplat.preparation.target import CORRECTED, Target, wrote
 from heatsplat.preparation.writer import write_bounds, write_world
 from heatsplat.runs.run import load
 
@@ -263,6 +263,11 @@ def _check(
         raise SceneError(
             f"target={target} is the folder of the scene that is to be corrected, whose images would be lost: give another one"
         )
+    if scene_folder is not None and wrote(scene_folder) == CORRECTED:
+        raise SceneError(
+            f"{scene_folder} is corrected already, and would be corrected twice: give the ckpt of a run on the scene that it "
+            "was made from"
+        )
 
 
 def _celsius(scene: SceneData, view: View) -> Tensor:
@@ -463,10 +468,14 @@ def preparation_of(name: str, folders: Sequence[Path]) -> tuple[Response | None,
 
 
 def _write_cameras(target: Path, scene: SceneData, cameras: Mapping[str, Camera]) -> None:
+    """Cameras and points in the coordinates of the data set: what lies at a place in one scene lies there in the other."""
     kinds, camera_of = pinholes(cameras)
-    poses = {name: camera.viewmat.numpy() for name, camera in cameras.items()}
+    poses = {name: camera.viewmat.clone() for name, camera in cameras.items()}
+    for pose in poses.values():
+        pose[:3, 3] -= pose[:3, :3] @ scene.origin
+    poses = {name: pose.numpy() for name, pose in poses.items()}
     colours = scene.point_colors if scene.point_colors is not None else torch.full((len(scene.points), 3), 0.5)
-    points = scene.points.double().numpy()
+    points = (scene.points.double() + scene.origin).numpy()
     write_model(target / "sparse" / "0", poses, kinds, points, _bytes(colours), camera_of=camera_of)
 
 

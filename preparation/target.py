@@ -51,7 +51,7 @@ class Target:
                 "outside of it"
             )
         record = read_json_object(self.folder / RECORD)
-        ours = record is not None and record.get("made") == self.made
+        ours = wrote(self.folder) == self.made
         if not ours and (foreign := self._first()) is not None:
             raise SceneError(
                 f"{foreign} is of something else than a scene {self.made}, and would be replaced; give an empty folder as "
@@ -79,6 +79,11 @@ class Target:
         files = [self.folder / name for name in FILES]
         inside = (path for name in FOLDERS for path in sorted((self.folder / name).rglob("*")))
         return next((path for path in (*inside, *files) if path.is_file()), None)
+
+
+def wrote(folder: Path) -> str | None:
+    """What a folder that was written here is: ``PREPARED`` or ``CORRECTED``; None of any other."""
+    return (read_json_object(folder / RECORD) or {}).get("made")
 
 
 def _digest(folder: Path) -> str | None:

@@ -86,7 +86,7 @@ def scene():
         "points": points,
         "point_colors": None,
     }
-    return SimpleNamespace(**scene, notes={"axes": "east, north, up"})
+    return SimpleNamespace(**scene, notes={"axes": "east, north, up"}, origin=torch.zeros(3, dtype=torch.float64))
 
 
 def test_a_scene_becomes_a_corrected_one_that_loads(tmp_path):
@@ -105,6 +105,36 @@ def test_a_scene_becomes_a_corrected_one_that_loads(tmp_path):
     assert sorted(frame.time_s for frame in frames) == [-2.0, 0.0, 2.0]  # 0 is the first training frame
     torch.testing.assert_close(frames[0].camera.K, CAMERA.K)
     assert module.scene.metres_per_unit == METRES
+
+
+def test_a_corrected_scene_has_the_coordinates_of_the_data_set(tmp_path):
+    utm, floor = torch.tensor([500000.0, 5500000.0, 100.0], dtype=torch.float64), scene()
+    floor.origin = utm  # what a data set in UTM loses when it is loaded
+    correct_scene(floor, lambda frame: DEPTH, [], tmp_path, GivenConditions(), BandResponse(), None, METRES)
+    again = Colmap(root=str(tmp_path))
+    again.setup()
+    found = again.scene
+    torch.testing.assert_close(
+        found.train.frames[0].camera.center + found.origin, CAMERA.center + utm, rtol=0, atol=1e-6
+    )
+    points = torch.cat([found.points.double() + found.origin, floor.points.double() + utm]).sort(0).values
+    torch.testing.assert_close(points[::2], points[1::2], rtol=0, atol=1e-4)
+
+
+def test_a_corrected_scene_is_not_corrected_again(tmp_path):
+    given = GivenConditions(emissivity=0.9)
+    correct_scene(scene(), lambda frame: DEPTH, [], tmp_path / "a", given, BandResponse(), None, METRES)
+    with pytest.raises(SceneError, match="is corrected already.*ckpt of a run on the scene that it was made from"):
+        correct_scene(
+            scene(),
+            lambda frame: DEPTH,
+            [tmp_path, tmp_path / "a"],
+            tmp_path / "b",
+            given,
+            BandResponse(),
+            None,
+            METRES,
+        )
 
 
 def test_images_are_held_one_at_a_time(tmp_path):
