@@ -125,7 +125,7 @@ class Table:
         return cell.replace(",", ".") if self.decimal_comma else cell
 
 
-def read_table(path: Path, names_columns: Callable[[list[str]], bool] | None = None) -> Table:
+def read_table(path: Path, names_columns: Callable[[list[str]], bool] | None = None, comments: bool = True) -> Table:
     """A table with a line of column names.
 
     **Convention:** columns are separated by comma, semicolon, tab or bar, whichever that line has most of; only
@@ -136,11 +136,12 @@ def read_table(path: Path, names_columns: Callable[[list[str]], bool] | None = N
         path: of the table.
         names_columns: whether the cells of a line are names of columns: what stands before the first such line, as programs say
             where and when they measured, is skipped. None, and where there is no such line, for the first one.
+        comments: whether lines that begin with # are skipped; False where a name may begin so.
 
     Raises:
         SceneError: it cannot be read, or a row has fewer or more cells than there are columns; the message names the line.
     """
-    lines = table_lines(read_text(path))
+    lines = table_lines(read_text(path), comments)
     if not lines:
         raise SceneError(f"{path} is empty; a line of column names and rows below it are needed")
 

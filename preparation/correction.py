@@ -24,7 +24,7 @@ from heatsplat.contracts import Camera, SceneData, SceneError, View, ViewSet, ch
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import pinholes, write_model
-from heatsplat.datamodules.side_files import read_table
+from heatsplat.datamodules.side_files import found_file, read_table
 from heatsplat.export.place import placed, unit_in_metres
 from heatsplat.geometry.sight_lines import cosines, distances, normals
 from heatsplat.io.pictures import Bar, Panel, colorize, write_png
@@ -44,8 +44,9 @@ from heatsplat.physics.radiometry import (
     surface_temperature,
 )
 from heatsplat.physics.units import KELVIN_AT_0_C
-from heatsplat.preparation.conditions import GivenConditions
+from heatsplat.preparation.conditions import GivenConditions, InputUncertainty
 from heatsplat.preparation.frame import Attitude, Position
+from heatsplat.preparation.regions import OPTION, Parts, Region, Regions, read_regions
 from heatsplat.preparation.report import Section, write_report
 from heatsplat.preparation.target import CORRECTED, Target, wrote
 from heatsplat.preparation.writer import write_bounds, write_world
@@ -55,6 +56,7 @@ log = logging.getLogger(__name__)
 
 PLACED = [part.name for kind in (Position, Attitude) for part in fields(kind)]  # columns of frames.csv
 GRAZING = 0.17  # cosine of 80°: beyond, a smooth surface is an idea
+REGIONS_PICTURE = "report/regions.png"
 PERCENT = (1, 5, 50, 95, 99)
 ASSUMED = "Nothing says what air the scene was recorded in, so 20 °C and 50 % are assumed"
 TURNED, FEW_POINTS = 15.0, 30  # degrees by which views may disagree on normals (ours), and points that tell it
@@ -70,16 +72,22 @@ class Corrected:
     Args:
         one: °C with one distance for all pixels and no angle, [H, W] float64.
         distance_only: °C with a distance for each pixel.
-        celsius: °C with a distance and an angle for each pixel.
+        alike: °C with a distance and an angle for each pixel, and the same surfaces everywhere.
+        celsius: the same, in regions with the emissivity of each.
         distance_m: to the surface; NaN where there is none.
         angle_deg: between line of sight and normal; NaN where it is not known.
+        known: [H, W] bool, pixels of which the image has a temperature.
+        parts: of the regions; None without any.
     """
 
     one: Tensor
     distance_only: Tensor
+    alike: Tensor
     celsius: Tensor
     distance_m: Tensor
     angle_deg: Tensor
+    known: Tensor
+    parts: Parts | None = None
 
 
 def corrected(
@@ -91,6 +99,7 @@ def corrected(
     done: Conditions,
     wanted: Conditions,
     index: float | None,
+    regions: Regions | None = None,
 ) -> Corrected:
     """An image of a trained scene under conditions that are known for each pixel.
 
@@ -102,6 +111,7 @@ def corrected(
         done: conditions that the temperatures are corrected for already; that is taken back first.
         wanted: those to correct for; their distance is the one for all pixels, and stays where there is no surface.
         index: refractive index of the surfaces; None leaves the emissivity the same at all angles.
+        regions: of the scene whose surfaces have an emissivity of their own.
     """
     signal = measured_signal(celsius.double() + KELVIN_AT_0_C, response, done)
     metres = distances(camera, depth) * metres_per_unit
@@ -113,12 +123,17 @@ def corrected(
         return surface_temperature(signal, response, conditions) - KELVIN_AT_0_C
 
     one, distance_only = under(wanted), under(near)
-    all_of_it = distance_only
+    seen = cosine.nan_to_num(1.0).clamp(min=GRAZING)
+    alike = distance_only
     if index is not None:
-        seen = cosine.nan_to_num(1.0).clamp(min=GRAZING)
-        all_of_it = under(replace(near, emissivity=directional_emissivity(wanted.emissivity, seen, index)))
+        alike = under(replace(near, emissivity=directional_emissivity(wanted.emissivity, seen, index)))
+    parts, all_of_it = None, alike
+    if regions is not None:
+        parts = regions.parts(camera, depth, signal, response, near, seen, index, alike)
+        all_of_it = torch.where(parts.number >= 0, parts.celsius, alike).where(~parts.edge, torch.nan)
     angle = torch.rad2deg(torch.arccos(cosine))
-    return Corrected(one, distance_only, all_of_it, metres.where(there, torch.nan), angle)
+    known = celsius.isfinite()
+    return Corrected(one, distance_only, alike, all_of_it, metres.where(there, torch.nan), angle, known, parts)
 
 
 def correct(
@@ -129,6 +144,8 @@ def correct(
     band_um: Sequence[float],
     refractive_index: float | None,
     metres_per_unit: float | None,
+    regions: str | None = None,
+    uncertainty: Mapping[str, float] | None = None,
     downscale: float | None = 1.0,
     trust: Sequence[str] = (),
 ) -> Path:
@@ -145,13 +162,16 @@ def correct(
         band_um: wavelengths in which the camera sees, where the preparation did not keep its calibration.
         refractive_index: of the surfaces, above 1; None for an emissivity without an angle.
         metres_per_unit: scale of the world; None takes the scene's, or that of its cameras' positions.
+        regions: table of the boxes whose surfaces have an emissivity of their own (``read_regions``), or None.
+        uncertainty: arguments of ``InputUncertainty``; what they leave in regions is reported.
         downscale: factor by which images shrink first, whatever the run was trained at; None is what it was trained at.
         trust: classes of yours that the checkpoint may name.
 
     Raises:
-        SceneError: the scene has no temperatures or no scale, ``target`` is its own folder or holds what no correction wrote, or
-            the conditions leave nothing to correct.
+        SceneError: the scene has no temperatures or no scale or is corrected already, ``target`` is its own folder or holds what
+            no correction wrote, the table of regions is none, or the conditions leave nothing to correct.
     """
+    boxes = [] if regions is None else read_regions(found_file(OPTION, regions, None))
     recorded = {"downscale": downscale, "degrade": "null", "upsample": "null"}  # a run may have been given less
     trained = load(ckpt, data=recorded, trust=trust)
     root = Path(trained.config["data"]["root"] or ".")
@@ -165,6 +185,8 @@ def correct(
         BandResponse(Band(*band_um, nodes=16)),
         refractive_index,
         metres_per_unit or scale_of(trained.scene),
+        boxes,
+        InputUncertainty(**(uncertainty or {})),
     )
 
 
@@ -182,6 +204,8 @@ def correct_scene(
     response: Response,
     index: float | None,
     metres_per_unit: float | None,
+    boxes: Sequence[Region] = (),
+    uncertain: InputUncertainty | None = None,
 ) -> Path:
     """As ``correct``, of a scene whose depth [H, W] in a frame ``depth_of`` gives; ``folders`` may hold its preparation."""
     _check(scene, folders, target, index, metres_per_unit)
@@ -197,6 +221,7 @@ def correct_scene(
         log.warning("%s", doubt)
 
     outcome, recorded = Outcome(), _recorded(folders)
+    regions = Regions(boxes, uncertain or InputUncertainty(), scene.origin) if boxes else None
     for number, view in enumerate(track(views, "correcting")):
         calibration, done = preparation_of(view.frame.name, folders)
         wanted = given.conditions(done)
@@ -211,10 +236,14 @@ def correct_scene(
             done,
             wanted,
             index,
+            regions,
         )
         file = f"{Path(view.frame.name).with_suffix('').as_posix()}.tiff"
         write_temperature(target / "images" / file, image.celsius.float().numpy())
         outcome.add(file, view.camera, image, wanted, air_assumed=given.air_c is None and done.distance_m == 0)
+        if regions is not None:
+            guessed = given.reflected_c is None and done.emissivity == 1
+            regions.add(view.camera, image.parts, image.alike, image.celsius, image.known, guessed)
         timed = {} if view.frame.time_s is None else {"time_s": view.frame.time_s}
         outcome.rows.append({"file": file, **timed, **recorded.get(stem_of(file), {})})
         if number == len(views) // 2:
@@ -230,12 +259,22 @@ def correct_scene(
     write_world(target, metres_per_unit, scene.notes.get("axes"))
     write_bounds(target, outcome.low, outcome.high)
     write_png(target / "report" / "correction.png", _picture(outcome.shown))
-    if outcome.air_assumed:
-        doubts.append(f"{ASSUMED}: give conditions.air_c and conditions.humidity_percent.")
-        log.warning("%s", doubts[-1])
-    page = write_report(
-        target, [_section(outcome, far, index, doubts)], f"{CORRECTED} by the trained scene {scene.name}"
-    )
+    late = [f"{ASSUMED}: give conditions.air_c and conditions.humidity_percent."] if outcome.air_assumed else []
+    if outcome.lost:
+        late.append(
+            f"{outcome.lost:,} pixels{' outside of all regions' if boxes else ''} have no temperature under these conditions, "
+            "and are left out (NaN): they would reflect more than was measured of them, or lie farther than the formula of "
+            "the air reaches."
+        )
+    sections = [_section(outcome, far, index, [*doubts, *late], bool(boxes))]
+    if regions is not None:
+        sections.append(regions.section(outcome.conditions, index, scene.points, REGIONS_PICTURE))
+        late += sections[-1].findings
+        if (picture := regions.picture()) is not None:
+            write_png(target / REGIONS_PICTURE, picture)
+    for doubt in late:
+        log.warning("%s", doubt)
+    page = write_report(target, sections, f"{CORRECTED} by the trained scene {scene.name}")
     log.info("%s", page.with_suffix(".html"))
     return page
 
@@ -323,6 +362,7 @@ class Outcome:
         cameras: by file of the image.
         conditions: those that the last image was corrected for.
         air_assumed: whether nothing says of the air of some image what it was.
+        lost: pixels of all images, but for those in regions, that have a temperature no more.
         shown: the image that the report shows.
     """
 
@@ -334,13 +374,14 @@ class Outcome:
     cameras: dict[str, Camera] = field(default_factory=dict)
     conditions: Conditions = Conditions()
     air_assumed: bool = False
+    lost: int = 0
     shown: Corrected | None = None
 
     def add(self, file: str, camera: Camera, image: Corrected, conditions: Conditions, air_assumed: bool) -> None:
         """Counts an image."""
         self.changes["distance"].add(image.distance_only - image.one)
-        self.changes["angle"].add(image.celsius - image.distance_only)
-        self.changes["both"].add(image.celsius - image.one)
+        self.changes["angle"].add(image.alike - image.distance_only)
+        self.changes["both"].add(image.alike - image.one)
         self.without_angle.append(float(image.angle_deg.isnan().double().mean()))
         known = image.celsius.float().numpy()
         if np.isfinite(known).any():
@@ -348,6 +389,8 @@ class Outcome:
         self.cameras[file] = camera
         self.conditions = conditions
         self.air_assumed |= air_assumed
+        lost = image.known & image.alike.isnan()
+        self.lost += int((lost if image.parts is None else lost & (image.parts.number < 0)).sum())
 
 
 def _by_name(scene: SceneData) -> ViewSet:
@@ -484,7 +527,7 @@ def _bytes(colours: Tensor) -> np.ndarray:
 
 
 def _picture(found: Corrected) -> np.ndarray:
-    change = found.celsius - found.one
+    change = found.alike - found.one
     most = max(float(np.nanquantile(change.abs().numpy(), 0.99)), 1e-3)
     panels = []
     for values, title, unit, ends in (
@@ -500,8 +543,10 @@ def _picture(found: Corrected) -> np.ndarray:
     return side_by_side(panels)
 
 
-def _section(outcome: Outcome, far: float, index: float | None, doubts: Sequence[str]) -> Section:
-    """What a distance (and an angle, where it counts) for each pixel changed, in °C."""
+def _section(
+    outcome: Outcome, far: float, index: float | None, doubts: Sequence[str], regions: bool = False
+) -> Section:
+    """What a distance (and an angle, where it counts) for each pixel changed, in °C; with ``regions`` before these count."""
     conditions, without_angle = outcome.conditions, float(np.mean(outcome.without_angle))
     names = {"distance": "distance of each pixel"}
     if index is not None:
@@ -516,7 +561,8 @@ def _section(outcome: Outcome, far: float, index: float | None, doubts: Sequence
         }
     lines = [
         f"{len(outcome.cameras)} images, against one distance of {float(conditions.distance_m):.1f} m for all pixels (the "
-        f"scene's median is {far:.1f} m) and an emissivity of {float(conditions.emissivity):g} at every angle. Air "
+        f"scene's median is {far:.1f} m) and an emissivity of {float(conditions.emissivity):g} at every angle"
+        f"{' (in regions, too: they are below)' if regions else ''}. Air "
         f"{float(conditions.air_k) - KELVIN_AT_0_C:.1f} °C, {100 * float(conditions.humidity):.0f} %, reflected "
         f"{float(conditions.reflected_k) - KELVIN_AT_0_C:.1f} °C, "
         + (

@@ -308,7 +308,7 @@ def test_positions_tell_the_scale_where_the_scene_does_not(monkeypatch, own, sca
     floor = SimpleNamespace(metres_per_unit=own, name="floor", positions="frames.csv")
     trained = SimpleNamespace(config={"data": {"root": None}}, scene=floor, depth=None)
     monkeypatch.setattr(correction, "load", lambda ckpt, **given: trained)
-    monkeypatch.setattr(correction, "correct_scene", lambda *given: given[-1])
+    monkeypatch.setattr(correction, "correct_scene", lambda *given: given[7])
     settings = {"conditions": {}, "band_um": (8, 14), "refractive_index": None}
     assert correction.correct("a.ckpt", None, metres_per_unit=None, **settings) == scale
     assert correction.correct("a.ckpt", None, metres_per_unit=7.0, **settings) == 7.0

@@ -17,7 +17,10 @@ from viewer.test_payload import in_units
 from heatsplat.callbacks.viewer import ViewerPage
 from heatsplat.contracts import SceneError, ViewSet, evenly_spread
 from heatsplat.datamodules.listed_cameras import ListedCameras
+from heatsplat.geometry.projection import to_world
+from heatsplat.geometry.sight_lines import rays
 from heatsplat.io.tables import read_csv
+from heatsplat.preparation.regions import read_regions, region_of
 from heatsplat.renderers.settings import Renderer
 from heatsplat.runs.run import load
 from heatsplat.viewer import page as pages
@@ -777,6 +780,33 @@ def test_a_box_measures_the_pixels_below_it_as_the_renderer_makes_them(page, tra
     told = dict(zip(head.split(","), row.split(","), strict=True))
     assert float(told["mean (°C)"]) == pytest.approx(found["mean"], abs=1e-3)
     assert (told["name"], told["values"], int(told["pixels"])) == ("box 1", '"temperature"', found["count"])
+
+
+def test_a_box_on_the_picture_becomes_one_in_the_scene_around_what_it_shows(page, trained, tmp_path):
+    """Against the depth of the renderer: its surfaces lie in the box, and the box is little larger; with a column more it is a
+    table of regions."""
+    frame, origin = trained.scene.train.frames[0], [5000.0, -300.0, 20.0]
+    page.execute_script(f"viewer.probes.list = []; viewer.goTo(0); viewer.told.origin = {origin}")
+    page.execute_script("""viewer.areas.add({kind: 'box', from: [0.6, 0.7], to: [0.4, 0.5]});
+      viewer.areas.add({kind: 'line', from: [0.1, 0.1], to: [0.9, 0.9]}); viewer.frame(performance.now())""")
+    head, box, line = page.execute_script("return viewer.areas.table()").strip().split("\n")
+    assert head.endswith(",x1,y1,z1,x2,y2,z2") and line.endswith("," * 6)
+    path = tmp_path / "boxes.csv"
+    path.write_text(f"{head},emissivity\n{box},0.3\n", encoding="utf-8")
+    (region,) = read_regions(path)
+    camera = frame.camera
+    rows, columns = (
+        slice(round(0.5 * camera.height), round(0.7 * camera.height)), slice(round(0.4 * camera.width), round(0.6 * camera.width))
+    )  # fmt: skip
+    depth = trained.depth(frame).double()[..., None]
+    places = to_world(rays(camera) * depth, camera.viewmat)[rows, columns].reshape(-1, 3) + torch.tensor(origin)
+    assert (region_of([region], places) == 0).double().mean() > 0.95
+    ends = torch.stack([places.amin(0), places.amax(0)])
+    longest = (region.high - region.low).max()
+    assert (region.low < ends[1]).all() and (region.high > ends[0]).all()
+    assert ((region.high - region.low) - (ends[1] - ends[0]) < 0.15 * longest).all()
+    page.execute_script("viewer.areas.list = [{...viewer.areas.list[0], from: [-9, -9], to: [-8, -8]}]")
+    assert page.execute_script("return viewer.areas.corners(viewer.areas.list[0])") == [None] * 6
 
 
 def test_pixels_without_a_surface_do_not_count_in_a_box(page):

@@ -513,8 +513,13 @@ def literal(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def lettering(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str) -> None:
-    """Writes white text with a dark edge on a picture, its left end at half height at ``place``."""
+def lettering(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str, within: float | None = None) -> None:
+    """Writes white text with a dark edge on a picture, its left end at half height at ``place``; with a width of the picture its
+    middle, or as near as it fits ``within``."""
+    if within is not None:
+        text = _fit(text, within - 4)
+        half = _font(FONT).getlength(text) / 2
+        place = min(max(place[0], half + 2), within - half - 2) - half, place[1]
     draw.text(place, text, font=_font(FONT), fill="white", anchor="lm", stroke_width=2, stroke_fill=INK)
 
 

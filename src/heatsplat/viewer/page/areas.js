@@ -4,6 +4,10 @@
 const MOVING_PIXELS = 20000;  // of an area that are measured while something moves
 const SURFACE = 0.5;  // alpha of a pixel that shows a surface, not the edge of the scene
 const LINE_POINTS = 400;
+const CORNERS = ["x1", "y1", "z1", "x2", "y2", "z2"];  // columns of a table of boxes in the scene
+const CORNER_POINTS = 12;  // of a box, along each side, that are looked up in the scene
+const LEFT_OUT = 0.02;  // share of them at each end of an axis that may lie elsewhere: on what is seen past an edge
+const MARGIN = 0.05;  // of its longest edge, by which a box in the scene is wider to each side: a wall is not flat, and depths are rough
 
 class Areas {
   constructor(viewer) {
@@ -118,15 +122,35 @@ class Areas {
     this.list.forEach((area) => this.measure(area, moving));
   }
 
-  // A table with a row for each box and line, as the panel shows them: what is measured, when, and values.
+  // Two opposite corners of a box in the scene around the surfaces that a box on the picture shows, in the coordinates of the scene's
+  // files, as src/prepare.py takes them (correct.regions); nulls for a line, and where there is no surface.
+  corners(area) {
+    const { camera, splats, told } = this.viewer, origin = told.origin || [0, 0, 0], places = [];
+    const along = (i, axis) => area.from[axis] + (i + 0.5) / CORNER_POINTS * (area.to[axis] - area.from[axis]);
+    for (let i = 0; area.kind === "box" && i < CORNER_POINTS ** 2; i++) {
+      const [px, py] = [along(i % CORNER_POINTS, 0) * camera.width, along(Math.floor(i / CORNER_POINTS), 1) * camera.height];
+      const { left, depth } = splats.weightsAt(camera, px, py);
+      if (1 - left > SURFACE) places.push(plus(camera.point(px, py, depth), origin));
+    }
+    if (!places.length) return new Array(6).fill(null);
+    const ends = [0, 1, 2].map((axis) => {
+      const sorted = places.map((place) => place[axis]).sort((a, b) => a - b), out = Math.floor(LEFT_OUT * sorted.length);
+      return [sorted[out], sorted[sorted.length - 1 - out]];
+    });
+    const longest = Math.max(...ends.map(([low, high]) => high - low), 1e-9), digits = Math.max(0, 3 - Math.floor(Math.log10(longest)));
+    return [-1, 1].flatMap((side, i) => ends.map((end) => (end[i] + side * MARGIN * longest).toFixed(digits)));
+  }
+
+  // A table with a row for each box and line, as the panel shows them: what is measured, when, values, and where a box lies.
   table() {
     const { viewer } = this, { told, state } = viewer, unit = viewer.unit ? ` (${viewer.unit})` : "", digits = viewer.unit ? 3 : 5;
     const quoted = (text) => `"${text.replaceAll('"', '""')}"`, values = viewer.attribute ? (value) => value.toPrecision(6) : (value) => value.toFixed(digits);
     const when = told.span ? [["time (s)", state.time.toFixed(3)], ...clockColumn(told, [state.time]).map(([name, [clock]]) => [name, clock])] : [];
     this.measureAll(false);
-    const rows = this.list.map(({ name, found }) => [["name", name], ["values", quoted(viewer.shownName)], ...when,
+    const rows = this.list.map(({ name, found }, k) => [["name", name], ["values", quoted(viewer.shownName)], ...when,
       [`min${unit}`, found && values(found.cold.value)], [`mean${unit}`, found && values(found.mean)], [`max${unit}`, found && values(found.hot.value)],
       [`standard deviation${unit}`, found && values(found.deviation)], ["pixels", found ? found.count : 0],
+      ...this.corners(this.list[k]).map((place, i) => [CORNERS[i], place]),
       ...viewer.isotherm.ends ? [[quoted(`${viewer.isotherm.words} (%)`), found && (100 * found.marked).toFixed(2)]] : []]);
     return [rows[0].map(([name]) => name), ...rows.map((row) => row.map(([, cell]) => cell ?? ""))].map((row) => row.join()).join("\n") + "\n";
   }
