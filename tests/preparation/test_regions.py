@@ -220,10 +220,25 @@ def test_pixels_that_reflect_more_than_was_measured_are_left_out_and_counted(tmp
     assert "-1" not in bounds and "nan" not in bounds.lower()
 
 
+@pytest.mark.parametrize(("own_c", "possible"), [(-150.0, False), (-90.0, True)])
+def test_what_no_surface_is_as_cold_as_is_impossible_too(tmp_path, own_c, possible):
+    """Less than nothing is left beside the reflection in theory; in practice already where next to nothing is."""
+    sent = 0.2 * radiance(own_c) + 0.8 * radiance(10.0)
+    measured = brentq(lambda found: radiance(found) - sent, -80.0, 50.0, xtol=1e-10)
+    everything = torch.full((3,), 1e6, dtype=torch.float64)
+    whole = Regions([Region("all", -everything, everything, 0.2, 10.0)], InputUncertainty(), ORIGIN)
+    image, still = torch.full_like(DEPTH, measured), Conditions(air_k=measured + 273.15)
+    found = corrected(image, CAMERA, DEPTH, 1e-9, BandResponse(Band(nodes=64)), still, still, None, whole)
+    if possible:
+        torch.testing.assert_close(found.celsius, torch.full_like(DEPTH, own_c), rtol=0, atol=1e-3)
+    assert found.celsius.isnan().all() != possible
+
+
 def test_pixels_outside_of_regions_that_have_no_temperature_are_counted(tmp_path, filmed):
     given = replace(GIVEN, emissivity=0.2, reflected_c=60.0)
     image, text, _ = corrected_by(tmp_path, filmed[1], boxes(tmp_path), given=given)
     outside = np.isnan(image) & ~(METAL | GLASS).numpy()
+    assert np.isnan(image[at_edges(GLASS.numpy())]).all()  # on the other side they would have none
     assert outside.sum() > 800 and f"{3 * outside.sum():,} pixels outside of all regions have no temperature" in text
 
 
