@@ -56,9 +56,8 @@ FARTHEST = 1e12  # beyond lie no coordinates
 # Below it a surface sends more of its surroundings than of itself, and is no smooth dielectric whose emissivity Fresnel's law
 # of the angle gives: metals.
 MIRRORS = 0.5
-COLDEST_C = (
-    -100.0
-)  # no surface that anyone records is colder: what is left beside the reflection is none of its own (ours)
+# No surface that anyone records is colder: what is left beside the reflection is none of its own (ours).
+COLDEST_C = -100.0
 EDGE_C = 2.0  # by which a pixel at an edge may differ with the region that it is counted to (ours)
 WHITE = (255, 255, 255)
 EDGE_POINTS = 64  # along an edge of a box that is drawn
