@@ -1,6 +1,7 @@
 """Meshes made of Gaussians: a scene of Gaussians on known surfaces, and a run."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -100,6 +101,25 @@ def test_a_box_makes_a_mesh_of_a_part(cooling, tmp_path):
     assert (np.abs(distance - radius) < 0.1 * radius).mean() > 0.95
 
 
+@pytest.mark.parametrize(("truncation", "found"), [(None, True), (4.0, False), (7.0, True)])
+def test_the_truncation_reaches_as_far_as_opacity_is_spread(cooling, monkeypatch, truncation, found):
+    ball, _, radius = on_a_ball(cooling)
+    depths = {view.frame.name: closest(ball, view)[0] for view in ball.module.scene.train}
+    voxel = 0.1 * radius
+
+    def spread(moment, view):
+        depth = depths[view.frame.name]
+        return depth, torch.full_like(depth, 6 * voxel).where(depth.isfinite(), torch.inf)
+
+    monkeypatch.setattr(made_surface, "closest", spread)
+    make = partial(made_surface.made_surface, ball, ball.module.scene.train, voxel, truncation, 0, 0.001)
+    if found:
+        assert len(make()[0].faces) > 500
+    else:
+        with pytest.raises(SceneError, match="spread over more than"):
+            make()
+
+
 def test_what_makes_no_mesh_is_said(cooling, tmp_path, monkeypatch, caplog):
     ball, _, radius = on_a_ball(cooling)
     clear = replace(ball, seen=replace(ball.seen, opacities=torch.full_like(ball.seen.opacities, 0.005)))
@@ -110,7 +130,7 @@ def test_what_makes_no_mesh_is_said(cooling, tmp_path, monkeypatch, caplog):
     with pytest.raises(
         SceneError, match=r"no surface is found with voxels of .* Give a coarser what.voxel or a larger what.truncation"
     ):
-        Mesh(views=3, voxel=0.001 * radius).write(ball, tmp_path / "a.ply")
+        Mesh(views=3, voxel=0.001 * radius, truncation=4).write(ball, tmp_path / "a.ply")
     monkeypatch.setattr(made_surface, "MOST", 40_000)
     with pytest.raises(SceneError, match=r"what.voxel=.* fits, or a part of the scene \(box\)"):
         Mesh(views=3, voxel=0.03 * radius).write(ball, tmp_path / "a.ply")
@@ -134,6 +154,7 @@ def test_one_view_makes_the_side_that_it_sees(cooling, tmp_path):
     [
         ({"voxel": 0}, "what.voxel must be above 0"),
         ({"voxel": "fine"}, "what.voxel must be a number, got fine"),
+        ({"smoothing": -1}, "what.smoothing must be a whole number, 0 or more, got -1"),
         ({"truncation": 1}, "what.truncation must be 2 voxels or more, got 1"),
         ({"least_piece": 2}, "what.least_piece must be a share of the area, from 0 to 1, got 2"),
         ({"two_sided": True}, "what.two_sided=true is for a mesh that you give"),

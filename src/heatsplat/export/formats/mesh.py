@@ -38,7 +38,7 @@ class Mesh(Format):
         colormap: name of a matplotlib map.
         range_c: °C at the ends of the map; None takes the scene's range.
         two_sided: normals are not to be trusted: every camera is before every face. Of a mesh that is given.
-        voxel, truncation, least_piece: as of ``export.made_surface.made_surface``, of a mesh that is made.
+        voxel, truncation, smoothing, least_piece: as of ``export.made_surface.made_surface``, of a mesh that is made.
     """
 
     suffix = ".ply"
@@ -52,16 +52,19 @@ class Mesh(Format):
         range_c: Sequence[float] | None = None,
         two_sided: bool = False,
         voxel: float | None = None,
-        truncation: float = 4.0,
+        truncation: float | None = None,
+        smoothing: int = 50,
         least_piece: float = 0.001,
     ) -> None:
         if views is not None:
             check_count("what.views", views)
         if voxel is not None:
             check_numbers("what.voxel", voxel, error=SceneError, above=0)
-        check_numbers("what.truncation", truncation, error=SceneError)
+        if truncation is not None:
+            check_numbers("what.truncation", truncation, error=SceneError)
+        check_count("what.smoothing", smoothing, least=0)
         check_numbers("what.least_piece", least_piece, error=SceneError)
-        if truncation < 2:
+        if truncation is not None and truncation < 2:
             raise SceneError(f"what.truncation must be 2 voxels or more, got {truncation:g}")
         if not 0 <= least_piece <= 1:
             raise SceneError(f"what.least_piece must be a share of the area, from 0 to 1, got {least_piece:g}")
@@ -72,7 +75,8 @@ class Mesh(Format):
         if mesh is not None and voxel is not None:
             raise SceneError("what.voxel is for a mesh that is made: leave out what.mesh, or what.voxel")
         self.mesh, self.views, self.two_sided = None if mesh is None else Path(mesh).expanduser(), views, two_sided
-        self.voxel, self.truncation, self.least_piece = voxel, truncation, least_piece
+        self.voxel, self.truncation = voxel, truncation
+        self.smoothing, self.least_piece = smoothing, least_piece
         self.colormap, self.range_c = checked_colormap("what.colormap", colormap), checked_range(range_c)
         self.of_gaussians = mesh is None
 
@@ -80,7 +84,7 @@ class Mesh(Format):
         scene = moment.module.scene
         views = [scene.train[i] for i in evenly_spread(len(scene.train), self.views or len(scene.train))]
         if self.mesh is None:
-            surface, depths = made_surface(moment, views, self.voxel, self.truncation, self.least_piece)
+            surface, depths = made_surface(moment, views, self.voxel, self.truncation, self.smoothing, self.least_piece)
             normals = surface.normals()
             looks = [replace(moment.look(view), depth=depth) for view, depth in zip(views, depths, strict=True)]
         else:
