@@ -128,7 +128,8 @@ def prepare(
         for finding in section.findings:
             log.warning("%s", finding)
     if poses:
-        sections += _cameras(poses, partial(doctor, target, reading, None) if doctor else None, frames, place, sections)
+        scene = replace(reading, palette=None, palette_hot=None)  # whose images are temperatures by now
+        sections += _cameras(poses, partial(doctor, target, scene, None) if doctor else None, frames, place, sections)
     page = report.write_report(target, sections)
     log.info("%s", page.with_suffix(".html"))
     return page

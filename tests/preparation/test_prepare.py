@@ -114,6 +114,17 @@ def test_pictures_in_false_colours_become_temperatures_between_bounds(tmp_path):
     np.testing.assert_allclose(turned[4:], 51 - levels[4:] / 5.0, atol=0.21)
 
 
+def test_the_doctor_takes_images_that_were_made_of_colours_for_temperatures(tmp_path):
+    levels = [np.clip(8 * temperatures() + i, 0, 255).astype(np.uint8) for i in range(9)]
+    colours = {
+        f"f{i}.png": np.rint(named("iron").curve(256)[image]).astype(np.uint8)[..., ::-1]
+        for i, image in enumerate(levels)
+    }
+    source, given = write_images(tmp_path / "files", colours), {"bounds_c": [0.0, 51.0], "palette": "iron"}
+    page = prepare(str(source), tmp_path / "scene", **PLAIN, **given, poses=poses, doctor=section)
+    assert "Doctor, with the cameras" in page.with_suffix(".md").read_text()
+
+
 def test_conditions_that_are_given_change_the_temperatures(tmp_path):
     source = write_flir(tmp_path / "files", 2)
     prepare(str(source), tmp_path / "a", **PLAIN)
