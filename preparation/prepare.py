@@ -54,8 +54,8 @@ def prepare(
     """Makes of a camera's files a scene that trains, and returns the path of its report.
 
     The folder then has images/ (float32 TIFF in °C, each with a .json of all that is known of it), masks/ where pixels are
-    dead, frames.csv (times, places), temperature_bounds.json, report.md, report.html, and what ``poses`` adds. Nothing in
-    ``source`` is changed.
+    dead, frames.csv (times, places), temperature_bounds.json (or .csv), report.md, report.html, and what ``poses`` adds. Nothing
+    in ``source`` is changed.
 
     Args:
         source: folder of the camera's files.

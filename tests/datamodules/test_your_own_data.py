@@ -27,6 +27,7 @@ def put(folder, *examples):
 def test_every_example_is_tried():
     tried = {
         "temperature_bounds.json",
+        "temperature_bounds.csv",
         "times.csv",
         "split.json",
         "transforms.json",
@@ -46,6 +47,13 @@ def test_the_colmap_example(tmp_path):
     assert (scene.thermal_range.min_c, scene.thermal_range.max_c) == (12.5, 48.0)
     assert scene.train.times_s == [0.0, 2.5] and scene.test.times_s == [5.0]
     assert [f.name for f in scene.test.frames] == FILES[2:]
+
+
+def test_the_example_of_a_span_for_each_image(tmp_path):
+    write_colmap(tmp_path, FILES)
+    put(tmp_path, "temperature_bounds.csv")
+    scene = Colmap(root=str(tmp_path)).scene
+    assert (scene.thermal_range.min_c, scene.thermal_range.max_c) == (11.9, 51.6)
 
 
 def test_the_transforms_example(tmp_path):
