@@ -12,6 +12,7 @@ from heatsplat.datamodules.formats.nerfstudio import THERMAL_KEYS, VISIBLE_KEYS
 from heatsplat.datamodules.nerfstudio import Nerfstudio
 from heatsplat.datamodules.rhd import RHD
 from heatsplat.datamodules.thermo import Thermo
+from heatsplat.preparation.regions import read_regions
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "your_own_data.md").read_text()
@@ -36,6 +37,7 @@ def test_every_example_is_tried():
         "info.json",
         "points.csv",
         "pixels.csv",
+        "regions.csv",
     }
     assert set(EXAMPLES) == tried
 
@@ -54,6 +56,12 @@ def test_the_example_of_a_span_for_each_image(tmp_path):
     put(tmp_path, "temperature_bounds.csv")
     scene = Colmap(root=str(tmp_path)).scene
     assert (scene.thermal_range.min_c, scene.thermal_range.max_c) == (11.9, 51.6)
+
+
+def test_the_example_of_regions(tmp_path):
+    put(tmp_path, "regions.csv")
+    regions = read_regions(tmp_path / "regions.csv")
+    assert [region.name for region in regions] == ["duct", "window", "tape on the duct"]
 
 
 def test_the_transforms_example(tmp_path):
