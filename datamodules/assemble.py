@@ -30,7 +30,7 @@ from heatsplat.contracts import (
     counted,
     evenly_spread,
 )
-from heatsplat.datamodules.bounds import BOUNDS_FILE, MIN_CELSIUS, celsius
+from heatsplat.datamodules.bounds import BOUNDS_FILE, BOUNDS_TABLE, MIN_CELSIUS, celsius, spans_told, union
 from heatsplat.datamodules.formats.images import PSEUDO_COLOUR_LEVELS
 from heatsplat.datamodules.formats.pseudo_colour import palette_notes
 from heatsplat.datamodules.poses import MAX_COORDINATE
@@ -63,6 +63,7 @@ class _Stored:
     zero: float
     full: float
     channels: int
+    ends: np.ndarray | None = None
 
     def decode(self) -> View:
         rgb = None
@@ -71,7 +72,8 @@ class _Stored:
             rgb = torch.from_numpy(np.divide(self.rgb, full, dtype=np.float32))
         mask = None if self.mask is None else torch.from_numpy(self.mask)
         thermal = None if self.thermal is None else torch.from_numpy(self._unit(self.thermal))
-        return View(frame=self.frame, thermal=thermal, rgb=rgb, mask=mask)
+        ends = None if self.ends is None else torch.from_numpy(self.ends)
+        return View(frame=self.frame, thermal=thermal, rgb=rgb, mask=mask, ends=ends)
 
     def _unit(self, stored: np.ndarray) -> np.ndarray:
         # numpy, not torch: a thread pool costs more than it gains on one image, and much more on a busy machine.
@@ -96,6 +98,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
         raise SceneError(f"scene {raw.name} has no frames")
     notes = dict(raw.notes)
     raw = _with_checked_numbers(_without_bounds_of_photos(raw, notes))
+    raw = _with_range_of_spans(raw, options)
     frames, times, time_notes = _in_order(raw.frames)
     notes |= time_notes
     train, test, val = _split(frames, options, notes)
@@ -111,7 +114,7 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
 
     used = sorted(set(train) | set(test))
     with ThreadPoolExecutor() as pool:  # decoding takes most of the time and leaves Python alone
-        images = pool.map(partial(prepare, options=options), [frames[i] for i in used])
+        images = pool.map(partial(prepare, options=options, bounds=raw.thermal_range), [frames[i] for i in used])
         prepared = dict(zip(used, images, strict=True))
     check_equals({frames[i].name: p for i, p in prepared.items()})
     check_masks(prepared.values())
@@ -122,6 +125,8 @@ def build_scene(raw: RawScene, options: SceneOptions) -> SceneData:
     if options.palette is not None:
         notes |= palette_notes(options.palette, {frames[i].name: p.fit for i, p in prepared.items()})
 
+    if spans := [frames[i].span for i in used if frames[i].span is not None]:
+        notes["bounds_source"] = f"{notes.get('bounds_source', 'frames')}: {spans_told(spans)}"
     stored: dict[int, _Stored] = {}
     for i in used:
         time_s = None if times is None else times[i] - first_s
@@ -178,6 +183,25 @@ def _without_bounds_of_photos(raw: RawScene, notes: dict[str, Any]) -> RawScene:
         raise SceneError(f"scene {raw.name} has thermal images of {thermal} frames and none of {photos}")
     notes["photos"] = "visible images only: an RGB scene, without thermal images and temperatures"
     return replace(raw, thermal_range=None)
+
+
+def _with_range_of_spans(raw: RawScene, options: SceneOptions) -> RawScene:
+    """The scene with the range that holds the spans of its frames, where they have such; without spans where it keeps colours."""
+    spans = [frame.span for frame in raw.frames if frame.span is not None]
+    if not spans:
+        return raw
+    if options.thermal_channels == 3:
+        return replace(raw, frames=[replace(frame, span=None) for frame in raw.frames])
+    if lacking := [frame.name for frame in raw.frames if frame.span is None]:
+        raise SceneError(
+            f"scene {raw.name}: {lacking[0]} has no span of temperatures, and {len(spans)} other images have one"
+        )
+    if raw.counts is not None:
+        raise SceneError(
+            f"scene {raw.name}: the numbers of its images have a map to °C, of which {BOUNDS_TABLE} changes nothing: take that "
+            "file away"
+        )
+    return replace(raw, thermal_range=union(spans))
 
 
 def _with_checked_numbers(raw: RawScene) -> RawScene:
@@ -341,8 +365,11 @@ def _store(
     if raw.weather is not None and environment is None:
         environment = weather_at_frame(raw.weather, frame.name, time_s)
     about = Frame(name=frame.name, frame_id=frame_id, camera=camera, time_s=time_s, environment=environment)
-    zero, full = _scaling(np.dtype(pixels.found["type"]), raw.counts, raw.thermal_range)
-    return _Stored(about, pixels.thermal, pixels.rgb, pixels.mask, zero, full, options.thermal_channels)
+    kind, counts = np.dtype(pixels.found["type"]), raw.counts
+    if frame.span is not None and kind.kind == "u":
+        counts = Counts(frame.span.span_k / np.iinfo(kind).max, frame.span.min_c)
+    zero, full = _scaling(kind, counts, raw.thermal_range)
+    return _Stored(about, pixels.thermal, pixels.rgb, pixels.mask, zero, full, options.thermal_channels, pixels.ends)
 
 
 def _of_points(what: str, values: np.ndarray | None, kept: np.ndarray) -> np.ndarray | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from torch.utils.data import DataLoader
 
 from heatsplat.contracts import SceneData, SceneError, check_option, counted
 from heatsplat.datamodules.assemble import build_scene
+from heatsplat.datamodules.bounds import Spans
 from heatsplat.datamodules.formats.images import ImageIndex, read_image, split_alpha, to_grey
 from heatsplat.datamodules.formats.lens import Lens
 from heatsplat.datamodules.formats.palette import palette_of
@@ -207,9 +209,18 @@ class SceneDataModule(pl.LightningDataModule, ABC):
             )
 
     def finish(
-        self, name: str, frames: Sequence[RawFrame], points: np.ndarray, split: SplitRule | None = None, **scene: Any
+        self,
+        name: str,
+        frames: Sequence[RawFrame],
+        points: np.ndarray,
+        split: SplitRule | None = None,
+        spans: Spans | None = None,
+        **scene: Any,
     ) -> SceneData:
-        """``build_scene`` of a ``RawScene`` with this module's options."""
+        """``build_scene`` of a ``RawScene`` with this module's options; thermal images have ``spans`` where there are such."""
+        if spans is not None and all(frame.read for frame in frames):
+            span_of = spans.of([frame.name for frame in frames])
+            frames = [replace(frame, span=span_of[frame.name]) for frame in frames]
         multiple = Reduction.parse(self.degrade).factor if self.degrade else 1
         options = SceneOptions(
             split or self.split,

@@ -13,7 +13,7 @@ import numpy as np
 
 from heatsplat.contracts import SceneData, SceneError, ThermalRange, check_option, table_lines
 from heatsplat.datamodules.base import CELSIUS, Counts, SceneDataModule
-from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
+from heatsplat.datamodules.bounds import Spans, bounds_in, range_in
 from heatsplat.datamodules.formats.colmap import find_model, nearly_model, read_model
 from heatsplat.datamodules.formats.images import ImageIndex, read_image
 from heatsplat.datamodules.formats.radiometric import has_temperatures, read_celsius, read_thermal
@@ -69,7 +69,8 @@ class Colmap(SceneDataModule):
         raw: folder of 16-bit counts with the same names, used in place of the images' greys, or None.
         raw_scale, raw_offset_c: °C = raw_scale * counts + raw_offset_c.
         radiometric: "auto" reads temperatures out of radiometric JPEGs, "never" takes their pictures as greys.
-        bounds_c: [min, max] in °C that 0 and 1 stand for; None takes temperature_bounds.json or the data's own range.
+        bounds_c: [min, max] in °C that 0 and 1 stand for; None takes temperature_bounds.json, the span of each image in
+            temperature_bounds.csv, or the data's own range.
         time_regex, time_format, time_csv, time_csv_name, time_csv_time: where times come from (``FrameTimes``).
         ambient_c: temperature of the surroundings in °C, or None.
         metres_per_unit: scale of the sparse model; None takes the world.json of a prepared folder, where there is one.
@@ -127,14 +128,13 @@ class Colmap(SceneDataModule):
         read, counts, encoding = self._reader(raw, index, [files[i] for i in kept])
         notes["encoding"] = encoding
         times, notes["time_source"] = self.times.of(folder, kept)
-        bounds, bounds_source = self._bounds(folder)
+        bounds, spans, bounds_notes = self._bounds(folder)
         metres_per_unit, axes = _world(folder)
         if axes:
             notes["axes"] = axes
         if (uncertainty := _uncertainty(index.folder / files[kept[0]])) is not None:
             notes["prepared_uncertainty_c"] = round(uncertainty, 2)
-        if bounds:
-            notes["bounds_source"] = bounds_source
+        notes |= bounds_notes
 
         def describe(name: str) -> dict[str, Any]:
             rgb_file = rgb.find(name) if rgb else None
@@ -163,6 +163,7 @@ class Colmap(SceneDataModule):
             points,
             point_colors=colors,
             thermal_range=bounds,
+            spans=spans,
             counts=counts,
             ambient_c=self.ambient_c,
             metres_per_unit=metres_per_unit if self.metres_per_unit is None else self.metres_per_unit,
@@ -195,11 +196,10 @@ class Colmap(SceneDataModule):
                 return read_celsius, CELSIUS, "temperatures of radiometric JPEGs (emissivity 1, no atmosphere)"
         return read_thermal, None, "greys, linear between the bounds where there are any"
 
-    def _bounds(self, folder: Path) -> tuple[ThermalRange | None, str]:
+    def _bounds(self, folder: Path) -> tuple[ThermalRange | None, Spans | None, dict[str, Any]]:
         if self.bounds_c is not None:
-            return range_in("data.bounds_c", *self.bounds_c)[0], "data.bounds_c"
-        file = folder / BOUNDS_FILE
-        return (read_bounds(file)[0], file.name) if file.is_file() else (None, "")
+            return range_in("data.bounds_c", *self.bounds_c)[0], None, {"bounds_source": "data.bounds_c"}
+        return bounds_in(folder)
 
 
 def _read_counts(path: Path) -> np.ndarray:

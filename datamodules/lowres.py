@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from heatsplat.contracts import Frame, SceneData, SceneError, View, ViewSet
-from heatsplat.geometry.resampling import KERNELS, resampled, valid_after
+from heatsplat.geometry.resampling import KERNELS, ends_on, resampled, valid_after
 
 # "lr" is the name that super-resolution papers give to bicubic reduction with antialiasing.
 REDUCTIONS = {"lr": "bicubic", "bicubic": "bicubic", "area": "area"}
@@ -111,4 +111,5 @@ def _on_grid(view: View, frame: Frame, height: int, width: int, kernel: str) -> 
         thermal=None if thermal is None else thermal.clamp(0.0, 1.0),
         rgb=None if rgb is None else rgb.clamp(0.0, 1.0),
         mask=moved(view.mask, valid_after),
+        ends=ends_on(view.ends, height, width),
     )

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from heatsplat.contracts import SceneData, SceneError, ThermalRange, counted
 from heatsplat.datamodules.base import RawFrame, SceneDataModule
-from heatsplat.datamodules.bounds import BOUNDS_FILE, read_bounds
+from heatsplat.datamodules.bounds import BOUNDS_FILE, Spans, bounds_in
 from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.formats.colmap import find_model, read_model
 from heatsplat.datamodules.formats.images import (
@@ -102,7 +102,7 @@ class Nerfstudio(SceneDataModule):
 
     def posed(self, folder: Path) -> SceneData:
         """The scene of the transforms files in a folder."""
-        bounds, notes = bounds_of(folder)
+        bounds, spans, notes = bounds_of(folder)
         listed = {read_transforms(path): subset for path, subset in find_transforms(folder).items()}
         first = next(iter(listed))
         notes["cameras"] = f"{' and '.join(t.path.name for t in listed)}, OpenGL axes"
@@ -129,6 +129,7 @@ class Nerfstudio(SceneDataModule):
             split=split,
             point_colors=colors,
             thermal_range=None if frames[0].read is None else bounds,
+            spans=spans,
             notes=notes,
         )
 
@@ -291,13 +292,11 @@ def find_transforms(folder: Path) -> dict[Path, str | None]:
     return {}
 
 
-def bounds_of(folder: Path) -> tuple[ThermalRange | None, dict[str, Any]]:
-    """Bounds, or None, and notes. ThermoScenes' own tools swap bounds in the wrong order, and so does this."""
-    path = folder / BOUNDS_FILE
-    if not path.is_file():
-        return None, {"bounds_source": f"none: there is no {BOUNDS_FILE}"}
-    bounds, swapped = read_bounds(path, swap=True)
-    return bounds, {"bounds_source": path.name + (" (minimum and maximum were swapped)" if swapped else "")}
+def bounds_of(folder: Path) -> tuple[ThermalRange | None, Spans | None, dict[str, Any]]:
+    """Bounds, or None, those of each image, or None, and notes. ThermoScenes' own tools swap bounds in the wrong order, and so
+    does this."""
+    bounds, spans, notes = bounds_in(folder, swap=True)
+    return bounds, spans, notes or {"bounds_source": f"none: there is no {BOUNDS_FILE}"}
 
 
 def _entries(folder: Path, listed: Mapping[Transforms, str | None], index: ImageIndex) -> list[Entry]:

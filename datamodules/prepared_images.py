@@ -11,15 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from heatsplat.contracts import SceneError, counted
-from heatsplat.datamodules.bounds import MAX_CELSIUS, MIN_CELSIUS
+from heatsplat.contracts import SceneError, ThermalRange, counted
+from heatsplat.datamodules.bounds import MAX_CELSIUS, MIN_CELSIUS, ends_of
 from heatsplat.datamodules.formats.images import (
     colour_levels,
     resized,
+    resized_ends,
     resized_mask,
     split_alpha,
     to_grey,
     undistorted,
+    undistorted_ends,
     undistorted_mask,
 )
 from heatsplat.datamodules.formats.lens import Lens
@@ -45,6 +47,7 @@ class PreparedImage:
         found: what the files held, for the notes.
         colour: grey levels by which the channels of the thermal image differ on average; 0 where a palette made one of them.
         fit: how well the thermal image fits its palette; None without one.
+        ends: [H, W] int8, where the thermal image was cut off (``View.ends``); None where it was not.
     """
 
     thermal: np.ndarray | None
@@ -54,10 +57,15 @@ class PreparedImage:
     found: dict[str, Any]
     colour: float
     fit: Fit | None = None
+    ends: np.ndarray | None = None
 
 
-def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
-    """Pixels of one frame on their final grid, undistorted, with the lens that belongs to them."""
+def prepare(frame: RawFrame, options: SceneOptions, bounds: ThermalRange | None = None) -> PreparedImage:
+    """Pixels of one frame on their final grid, undistorted, with the lens that belongs to them.
+
+    Args:
+        bounds: of the scene, where frames have spans of their own.
+    """
     read = frame.read or frame.read_rgb
     if read is None:
         raise SceneError(f"frame {frame.name} has neither a thermal nor a visible image")
@@ -75,6 +83,7 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
         "camera": f"{frame.lens.width}x{frame.lens.height}",
         "squeezed": _squeezed(width, height, frame.lens.width, frame.lens.height),
         "nan": 0,
+        "at_ends": 0,
         "rgb_resized": False,
         "rgb_squeezed": False,
     }
@@ -95,6 +104,11 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
         pixels, known = _filled(pixels, frame.name)
         if known is not None:
             found["nan"], mask = int(known.size - known.sum()), _both(mask, known)
+    ends = None
+    if frame.span is not None and options.thermal_channels == 1:
+        ends = _ends_of(pixels, frame, bounds)
+        found["at_ends"] = int(((ends != 0) if mask is None else (ends != 0) & mask).sum())
+        ends = ends if ends.any() else None
     rgb = None
     if frame.read is not None and frame.read_rgb is not None:
         rgb, _ = split_alpha(_supported(frame.read_rgb(), f"{frame.name} (visible)"))
@@ -105,6 +119,7 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
     lens = frame.lens.resized(width, height)
     if lens.is_distorted:
         pixels, mask = undistorted(pixels, lens), undistorted_mask(mask, lens)
+        ends = undistorted_ends(ends, lens)
         rgb = None if rgb is None else undistorted(rgb, lens)
     small = (width, height)
     if options.downscale > 1:
@@ -112,11 +127,12 @@ def prepare(frame: RawFrame, options: SceneOptions) -> PreparedImage:
     pixels = resized(pixels, *small)
     rgb = None if rgb is None else np.ascontiguousarray(resized(rgb, *small))
     mask = None if mask is None else resized_mask(mask, *small)
+    ends = None if ends is None else resized_ends(ends, *small)
     if mask is not None and mask.all():
         mask = None
     if frame.read is None:
         return PreparedImage(None, np.ascontiguousarray(pixels), mask, lens.resized(*small), found, colour=0.0)
-    return PreparedImage(np.ascontiguousarray(pixels), rgb, mask, lens.resized(*small), found, colour, fit)
+    return PreparedImage(np.ascontiguousarray(pixels), rgb, mask, lens.resized(*small), found, colour, fit, ends)
 
 
 def _shrunk(side: float, multiple: int) -> int:
@@ -162,6 +178,14 @@ def _filled(celsius: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray | No
         raise SceneError(f"image {name} holds no finite pixel that is a temperature in °C; remove it from the scene")
     # Any finite filling will do under the mask; the median keeps resampling well-behaved beside it.
     return np.where(known, celsius, np.median(celsius[known])), known
+
+
+def _ends_of(pixels: np.ndarray, frame: RawFrame, bounds: ThermalRange | None) -> np.ndarray:
+    """Where the image of a frame with a span was cut off (``bounds.ends_of``)."""
+    low, width = frame.span.min_c, frame.span.span_k
+    if pixels.dtype.kind == "u":
+        low, width = 0.0, float(np.iinfo(pixels.dtype).max)
+    return ends_of((pixels.astype(np.float32) - low) / width, frame.span, bounds or frame.span)
 
 
 def _three_channels(rgb: np.ndarray, name: str) -> np.ndarray:
@@ -258,6 +282,12 @@ def image_notes(prepared: Mapping[int, PreparedImage], downscale: float) -> dict
     if nan := sum(f["nan"] for f in found):
         notes["nan_pixels"] = f"{counted(nan, 'pixel')} masked: NaN, infinite or below absolute zero"
         log.warning("%s", notes["nan_pixels"])
+    if at_ends := [f["at_ends"] / math.prod(map(int, f["size"].split("x"))) for f in found if f["at_ends"]]:
+        notes["span_ends"] = (
+            f"{100 * sum(at_ends) / len(found):.2g} % of the pixels, at most {100 * max(at_ends):.2g} % of an image, lie at an "
+            "end of their image's span beyond which other images reach: the truth is taken for that or beyond"
+        )
+        log.info("%s", notes["span_ends"])
     notes |= _visible_notes(found)
     if resized_masks := sum(f["mask_resized"] for f in found):
         notes["masks_resized"] = f"{counted(resized_masks, 'mask')} of another size, resized to the image's"

@@ -33,6 +33,8 @@ class RawFrame:
         read_mask: returns [H, W] bool for the stored thermal image, True where a pixel counts, or None.
         subset: "train" or "test" where the data set itself says so (folder, list), else None.
         environment: weather at that time, or None.
+        span: °C of black and white of this image alone, or of what the camera drew before °C were made of it; values at its ends
+            are bounds. All frames have one, or none has.
     """
 
     name: str
@@ -44,6 +46,7 @@ class RawFrame:
     read_mask: Callable[[], np.ndarray] | None = None
     subset: str | None = None
     environment: Environment | None = None
+    span: ThermalRange | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "viewmat", checked_pose(self.viewmat, f"viewmat of frame {self.name}"))
@@ -77,7 +80,7 @@ class RawScene:
         points: [P, 3] in the world of the frames' ``viewmat``, at least 4 finite ones.
         point_colors: [P, 3] in [0, 1], or None.
         thermal_range: bounds in °C; with ``counts`` (or float pixels) and without bounds they are taken from the training
-            images.
+            images. Of frames with spans of their own it is the range that holds these.
         counts: map from stored numbers to °C, for raw sensor data; None when integers span their type.
         ambient_c: temperature of the surroundings, or None.
         metres_per_unit: scale of the world, or None.

@@ -40,13 +40,14 @@ class RGBTScenes(SceneDataModule):
         folder = self.scene_folder(is_paired, "thermal/ or a sparse model (sparse/0)")
         model = read_model(folder)
         frames, notes = paired_frames(self, folder, model, self.rgb)
-        bounds, bounds_notes = bounds_of(folder)
+        bounds, spans, bounds_notes = bounds_of(folder)
         return self.finish(
             folder.name,
             frames,
             model.points,
             point_colors=model.colors,
             thermal_range=bounds,
+            spans=spans,
             notes=notes | (bounds_notes if bounds else {}),
         )
 

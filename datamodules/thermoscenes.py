@@ -20,7 +20,7 @@ class ThermoScenes(Nerfstudio):
         folder = self.scene_folder(lambda p: bool(find_transforms(p)) or is_paired(p), "transforms_thermal.json")
         if find_transforms(folder):
             return self.posed(folder)
-        bounds, notes = bounds_of(folder)
+        bounds, spans, notes = bounds_of(folder)
         model = read_model(folder)
         frames, found = paired_frames(self, folder, model, self.rgb)
         split = self.split
@@ -33,5 +33,6 @@ class ThermoScenes(Nerfstudio):
             split=split,
             point_colors=model.colors,
             thermal_range=bounds,
+            spans=spans,
             notes=notes | found,
         )

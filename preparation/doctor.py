@@ -15,6 +15,7 @@ from heatsplat.contracts import SceneError, counted, evenly_spread
 from heatsplat.datamodules.base import SceneDataModule
 from heatsplat.datamodules.benchmark import Benchmark
 from heatsplat.datamodules.benchmark_folder import META, SCENES, TRUTH
+from heatsplat.datamodules.bounds import union
 from heatsplat.datamodules.colmap import Colmap
 from heatsplat.datamodules.formats.colmap import find_model
 from heatsplat.datamodules.formats.images import read_bytes
@@ -209,7 +210,8 @@ def _recorded(device: Device, zone: str | None) -> Material:
     chosen = evenly_spread(len(frames), MAX_FRAMES)
     images = torch.from_numpy(np.stack([frames[i].pixels() for i in chosen])).double()
     known = all(frame.calibration is not None for frame in frames)
-    bounds = _bounds_of_greys(frames[chosen[0]])
+    spans = [frame.span for frame in frames if frame.span is not None]
+    bounds = (union(spans).min_c, union(spans).max_c) if spans else _bounds_of_greys(frames[chosen[0]])
     if bounds is not None:
         images = (images - bounds[0]) / (bounds[1] - bounds[0])
     times = [None if frame.time is None else instant(frame.time) for frame in frames]
@@ -229,6 +231,8 @@ def _stored(frame: ThermalFrame) -> str:
     """What the files of a camera hold, as ``Material.stored`` has it."""
     if frame.calibration is not None and frame.calibration.scale is None:
         return "radiometric"
+    if frame.span is not None:
+        return "grey16" if frame.load().dtype == np.uint16 else "grey8"
     return {"u1": "grey8", "u2": "counts", "f4": "celsius"}.get(frame.load().dtype.str[1:], "")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, ThermalRange
 from heatsplat.datamodules.formats.radiometric import CELSIUS, Calibration, surface_celsius
 from heatsplat.physics.radiometry import Conditions
 
@@ -65,6 +65,7 @@ class ThermalFrame:
         size: width and height of its pixels; None where only they tell.
         rgb: photo that belongs to it, or None.
         picture: returns the bytes of the photo inside the file, or None where it has none.
+        span: °C of black and white of this frame alone, of greys and pictures in colours; None where they have none of their own.
     """
 
     name: str
@@ -81,6 +82,7 @@ class ThermalFrame:
     size: tuple[int, int] | None = None
     rgb: Path | None = None
     picture: Callable[[], bytes] | None = field(default=None, repr=False)
+    span: ThermalRange | None = field(default=None, repr=False)
 
     def temperature(self) -> np.ndarray:
         """Temperatures [H, W] float32 in °C of the surfaces, NaN where unknown.
@@ -89,7 +91,9 @@ class ThermalFrame:
             SceneError: the file cannot be read, or holds no temperatures.
         """
         if self.calibration is None:
-            raise SceneError(f"{self.path} holds greys without a meaning in °C; give bounds_c=[min,max]")
+            raise SceneError(
+                f"{self.path} holds greys without a meaning in °C; give bounds_c=[min,max], or spans in table="
+            )
         return surface_celsius(self.load(), self.calibration, self.conditions)
 
     def pixels(self) -> np.ndarray:

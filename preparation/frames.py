@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from heatsplat.contracts import SceneError, check_count, check_option, counted, evenly_spread
+from heatsplat.datamodules.bounds import spans_told, union
 from heatsplat.datamodules.formats import dji, flir
 from heatsplat.datamodules.formats.geodesy import east_north_up
 from heatsplat.datamodules.formats.images import (
@@ -31,7 +32,6 @@ from heatsplat.datamodules.formats.images import (
 )
 from heatsplat.datamodules.formats.palette import palette_of
 from heatsplat.datamodules.formats.pseudo_colour import PaletteReader
-from heatsplat.datamodules.formats.radiometric import Calibration
 from heatsplat.datamodules.formats.temperature_table import MIN_SIDE, read_temperature_table
 from heatsplat.datamodules.formats.temperature_table import SUFFIX as TABLE
 from heatsplat.datamodules.timestamps import dji_time, instant, zone_of
@@ -41,7 +41,7 @@ from heatsplat.preparation.frame import ColouredFrame, ThermalFrame, frame_name
 from heatsplat.preparation.makers import RECORDS, exif_details, radiometric_frames
 from heatsplat.preparation.meaning import Meaning
 from heatsplat.preparation.sharpness import sharpest
-from heatsplat.preparation.table import with_table
+from heatsplat.preparation.table import spans_of, tells_spans, with_table
 
 log = logging.getLogger(__name__)
 
@@ -59,6 +59,7 @@ KINDS = {
     "counts": "16-bit images",
     "grey": "8-bit greys",
 }
+FULL = {"grey": 255, "counts": 65535}  # the number of white
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,8 @@ class Reading:
         meaning: of numbers without a calibration.
         zone: of times that have none, such as Europe/Berlin or +02:00; None leaves them as they are.
         table: file with a row for each frame, or None.
-        columns: its columns: name, time, latitude_deg, longitude_deg, altitude_m, above_takeoff_m, yaw_deg, pitch_deg, roll_deg.
+        columns: its columns: name, time, latitude_deg, longitude_deg, altitude_m, above_takeoff_m, yaw_deg, pitch_deg, roll_deg,
+            and min_c and max_c, the °C of black and white of each of greys or pictures in colours.
         every: of each camera every so many-th frame is taken, the first one included.
         sharpest: of each camera the sharpest of each ``every`` frames in a row is taken instead.
         palette: of pictures in false colours, by name or file (``palette_of``), which makes greys of them; None for none.
@@ -137,12 +139,22 @@ def read_recording(folder: Path, reading: Reading | None = None) -> Recording:
         zone_of(reading.zone, "zone")
     if not folder.is_dir():
         raise SceneError(f"source={folder} is no folder")
-    greys_known = reading.meaning.of_greys(folder)[0] is not None
+    spanned = reading.table is not None and tells_spans(reading.table, reading.columns)
+    greys_known = spanned or reading.meaning.of_greys(folder)[0] is not None
     kinds, tables = _kinds_in(folder, greys_known, reading.palette)
     kind = next(kind for kind in KINDS if kinds.get(kind))
     reading.meaning.check_use(kind, KINDS[kind])
+    if spanned and kind == "grey" and reading.meaning.bounds_c is not None:
+        raise SceneError(
+            f"bounds_c is one span for all images, and table={reading.table} has one for each: leave bounds_c out, or take the "
+            "columns out of the table"
+        )
     notes: list[str] = []
-    frames = list(_frames_of(kind, kinds[kind], folder, reading, notes, tables))
+    frames = _frames_of(kind, kinds[kind], folder, reading, notes, tables)
+    if spanned and (kind == "grey" or (kind == "counts" and not reading.meaning.says_counts(frames[0].load()))):
+        frames = _with_spans(frames, kind, reading, notes)
+    elif kind != "radiometric":
+        frames = _with_calibrations(kind, frames, folder, reading.meaning, notes)
     photos = [*kinds.get("colour", []), *(kinds["grey"] if kind != "grey" and "grey" in kinds else [])]
     frames = _paired(frames, _without_previews(frames, photos, notes))
     if reading.table is not None:
@@ -308,7 +320,8 @@ def _greys_of_palette(
     if kinds.get("colour") and not greys_known:
         raise SceneError(
             f"palette={palette} tells levels from the colours of {kinds['colour'][0].name} and others; say which temperatures "
-            "the ends of the scale are: bounds_c=[min,max], in °C"
+            "the ends of the scale are: bounds_c=[min,max] in °C, or of each picture by a table with the columns file, min_c and "
+            "max_c (table=spans.csv)"
         )
     return {"grey": kinds["colour"]} if kinds.get("colour") else dict(kinds)
 
@@ -320,11 +333,10 @@ def _frames_of(
     reading: Reading,
     notes: list[str],
     tables: Mapping[Path, tuple[int, int]],
-) -> Iterator[ThermalFrame]:
+) -> list[ThermalFrame]:
+    """The frames in files of a kind; what numbers without a calibration mean is not settled yet."""
     if kind == "radiometric":
-        for path in paths:
-            yield from radiometric_frames(path, folder, reading.meaning, notes)
-        return
+        return [frame for path in paths for frame in radiometric_frames(path, folder, reading.meaning, notes)]
     found = []
     reader = None
     if reading.palette is not None:
@@ -358,14 +370,29 @@ def _frames_of(
         if doubt := reader.doubt():
             notes.append(doubt)
             log.warning("%s", doubt)
-    calibrations = _calibrations(kind, found, folder, reading.meaning, notes)
-    yield from (replace(frame, calibration=calibrations[frame.path]) for frame in found)
+    return found
 
 
-def _calibrations(
+def _with_spans(frames: Sequence[ThermalFrame], kind: str, reading: Reading, notes: list[str]) -> list[ThermalFrame]:
+    """Greys, or levels of colours, by the span that a table has of each of them."""
+    spans, full = spans_of(frames, reading.table, reading.columns), FULL[kind]
+    whole = union(spans.values())
+    told = spans_told(spans.values())
+    notes.append(f"greys of {whole.min_c:g} .. {whole.max_c:g} °C by {reading.table.name}: {told}")
+    return [
+        replace(
+            frame,
+            span=(span := spans[frame.name]),
+            calibration=reading.meaning.of_temperatures(span.span_k / full, span.min_c),
+        )
+        for frame in frames
+    ]
+
+
+def _with_calibrations(
     kind: str, frames: Sequence[ThermalFrame], folder: Path, meaning: Meaning, notes: list[str]
-) -> dict[Path, Calibration | None]:
-    """What the numbers in each file mean, by the first frame of its camera."""
+) -> list[ThermalFrame]:
+    """The frames with what the numbers in each file mean, by the first frame of its camera."""
     devices, calibrations = devices_of(frames), {}
     for device in devices:
         sample = device.frames[0]
@@ -386,7 +413,7 @@ def _calibrations(
         if note not in notes:
             notes.append(note)
         calibrations |= dict.fromkeys((frame.path for frame in device.frames), calibration)
-    return calibrations
+    return [replace(frame, calibration=calibrations[frame.path]) for frame in frames]
 
 
 def _grey(path: Path, page: int | None) -> np.ndarray:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from heatsplat.contracts import SceneError, check_numbers
-from heatsplat.datamodules.bounds import BOUNDS_FILE, range_in, read_bounds
+from heatsplat.datamodules.bounds import BOUNDS_FILE, BOUNDS_TABLE, range_in, read_bounds
 from heatsplat.datamodules.formats.dji import PER_KELVIN
 from heatsplat.datamodules.formats.radiometric import Calibration, other_unit
 from heatsplat.physics.planck import Band
@@ -148,6 +148,11 @@ class Meaning:
             )
         return self.of_temperatures(1.0, 0.0), "floating-point °C"
 
+    def says_counts(self, sample: np.ndarray) -> bool:
+        """Whether it is known what 16-bit numbers mean, as it is said, or they look like kelvin x 100."""
+        told = self.scale is not None or self.planck is not None
+        return told or is_centikelvin(*np.percentile(sample, (1, 50, 99)))
+
     def of_greys(self, folder: Path) -> tuple[Calibration | None, str]:
         """The calibration of 8-bit greys, None where no bounds are known, and a sentence about it."""
         found = None
@@ -156,7 +161,10 @@ class Meaning:
         elif files := [file for place in (folder, folder.parent) if (file := place / BOUNDS_FILE).is_file()]:
             found, source = read_bounds(files[0])[0], str(files[0])
         if found is None:
-            return None, "greys without bounds: no temperatures (bounds_c=[min,max] would give them)"
+            by = "bounds_c=[min,max]"
+            if (table := folder / BOUNDS_TABLE).is_file():
+                by = f"table={table}, with the span of each image,"
+            return None, f"greys without bounds: no temperatures ({by} would give them)"
         return (
             self.of_temperatures(found.span_k / 255.0, found.min_c),
             f"8-bit greys, {found.min_c:g} .. {found.max_c:g} °C by {source}",

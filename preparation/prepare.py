@@ -54,8 +54,8 @@ def prepare(
     """Makes of a camera's files a scene that trains, and returns the path of its report.
 
     The folder then has images/ (float32 TIFF in °C, each with a .json of all that is known of it), masks/ where pixels are
-    dead, frames.csv (times, places), temperature_bounds.json, report.md, report.html, and what ``poses`` adds. Nothing in
-    ``source`` is changed.
+    dead, frames.csv (times, places), temperature_bounds.json (or .csv), report.md, report.html, and what ``poses`` adds. Nothing
+    in ``source`` is changed.
 
     Args:
         source: folder of the camera's files.
@@ -128,7 +128,8 @@ def prepare(
         for finding in section.findings:
             log.warning("%s", finding)
     if poses:
-        sections += _cameras(poses, partial(doctor, target, reading, None) if doctor else None, frames, place, sections)
+        scene = replace(reading, palette=None, palette_hot=None)  # whose images are temperatures by now
+        sections += _cameras(poses, partial(doctor, target, scene, None) if doctor else None, frames, place, sections)
     page = report.write_report(target, sections)
     log.info("%s", page.with_suffix(".html"))
     return page

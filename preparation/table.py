@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,11 +10,14 @@ from dataclasses import MISSING, dataclass, fields, replace
 from datetime import datetime
 from pathlib import Path
 
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, ThermalRange, counted
+from heatsplat.datamodules.bounds import LOWER, NAMED, UPPER, span_in
 from heatsplat.datamodules.file_names import same_files
 from heatsplat.datamodules.side_files import Table, read_table
 from heatsplat.io.tables import SPELLINGS
 from heatsplat.preparation.frame import Attitude, Position, ThermalFrame
+
+log = logging.getLogger(__name__)
 
 Row = tuple[int, list[str]]  # number of its line, and its cells
 
@@ -22,6 +26,7 @@ NUMBERS = {
     Position: ("latitude_deg", "longitude_deg", "altitude_m", "above_takeoff_m"),
     Attitude: ("yaw_deg", "pitch_deg", "roll_deg"),
 }
+SPAN = (LOWER, UPPER)  # columns of the °C of black and white of a frame
 MOST_DEG = {"latitude_deg": 90.0, "longitude_deg": 180.0}
 
 
@@ -47,9 +52,11 @@ def with_table(
         if frame.name in rows:
             changes, read = table.changes(frame, rows[frame.name])
             frame = replace(frame, **changes)
-            used |= read
+            used |= read | (set(SPAN) if frame.span is not None else set())
         changed.append(frame)
     table.check_use(rows.values(), used)
+    if idle := [table.columns[key] for key in SPAN if key in table.at and key not in used]:
+        notes.append(f"{path.name}: {' and '.join(idle)} are not used, as the files hold temperatures by themselves")
     notes.append(f"{path.name} tells {', '.join(sorted(used)) or 'nothing'} of {len(rows)} of {len(frames)} frames")
     if unknown := [column for i, column in enumerate(table.table.columns) if column and i not in table.at.values()]:
         free = next((key for key in SPELLINGS if key not in table.at), "time")
@@ -58,6 +65,46 @@ def with_table(
             f"table_columns.{free}={unknown[0]}"
         )
     return changed
+
+
+def tells_spans(path: Path, columns: Mapping[str, str]) -> bool:
+    """Whether a table has columns of the °C of black and white of each frame. Raises SceneError where it has one of the two."""
+    table = FrameTable.read(path, columns)
+    there = [key for key in SPAN if key in table.at]
+    if len(there) == 1:
+        lacking = next(key for key in SPAN if key not in there)
+        raise SceneError(
+            f"table={path} has a column {table.columns[there[0]]} and none {table.columns.get(lacking, lacking)}: the °C of "
+            f"black and of white are needed; say which is which, as in table_columns.{lacking}={table.table.columns[-1]}"
+        )
+    return bool(there)
+
+
+def spans_of(frames: Sequence[ThermalFrame], path: Path, columns: Mapping[str, str]) -> dict[str, ThermalRange]:
+    """The °C of black and white of each frame, by its name; rows that are of no frame are warned of.
+
+    Args:
+        frames, path, columns: as of ``with_table``; the table tells spans.
+
+    Raises:
+        SceneError: a frame has no row or an empty one, or its two cells are no rising temperatures.
+    """
+    table = FrameTable.read(path, columns)
+    rows = table.rows_of(frames)
+    lower, upper = (table.at[key] for key in SPAN)
+    known = {name: row for name, row in rows.items() if row[1][lower] or row[1][upper]}
+    if lacking := [frame.path.name for frame in frames if frame.name not in known]:
+        raise SceneError(
+            f"table={path} has no {table.columns[LOWER]} and {table.columns[UPPER]} of {counted(len(lacking), 'frame')} of "
+            f"{len(frames)}, such as {', '.join(lacking[:NAMED])}: add them, or take these files out of the source"
+        )
+    used = {line for line, _ in rows.values()}
+    if idle := [cells[table.at["name"]] for line, cells in table.table.rows if line not in used]:
+        log.warning(
+            "%s: %s of no frame, such as %s: are these files missing, or called otherwise?",
+            *(path, counted(len(idle), "row"), ", ".join(idle[:NAMED])),
+        )
+    return {name: span_in(table.table, line, cells[lower], cells[upper]) for name, (line, cells) in known.items()}
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from heatsplat.contracts import SceneError
-from heatsplat.datamodules.bounds import BOUNDS_FILE
+from heatsplat.datamodules.bounds import BOUNDS_FILE, BOUNDS_TABLE
 from heatsplat.datamodules.colmap import FRAMES_FILE, WORLD_FILE
 from heatsplat.io.files import read_json_object, write_atomically
 from heatsplat.io.page import PAGE_FILE
@@ -20,7 +20,7 @@ REPORT = "report.md"
 CAMERAS = "sparse/0"
 PREPARED, CORRECTED = "prepared from a camera's files", "corrected pixel by pixel"
 FOLDERS = ("images", "masks", "counts", "visible", "report")
-FILES = (FRAMES_FILE, BOUNDS_FILE, WORLD_FILE, REPORT, PAGE_FILE)
+FILES = (FRAMES_FILE, BOUNDS_FILE, BOUNDS_TABLE, WORLD_FILE, REPORT, PAGE_FILE)
 
 
 class Target:

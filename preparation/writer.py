@@ -20,10 +20,10 @@ import numpy as np
 import torch
 
 from heatsplat.contracts import SceneError, evenly_spread
-from heatsplat.datamodules.bounds import BOUNDS_FILE
+from heatsplat.datamodules.bounds import BOUNDS_FILE, BOUNDS_TABLE, LOWER, NAMES, UPPER
 from heatsplat.datamodules.colmap import FRAMES_FILE, WORLD_FILE
 from heatsplat.datamodules.formats.images import SUFFIXES, read_grey
-from heatsplat.datamodules.formats.radiometric import Calibration
+from heatsplat.datamodules.formats.radiometric import Calibration, surface_celsius
 from heatsplat.datamodules.side_files import read_table
 from heatsplat.datamodules.timestamps import instant
 from heatsplat.doctor.base import some
@@ -189,17 +189,20 @@ class Writer:
         return self.target / "masks" / f"{image}.png"
 
     def finish(self, frames: Sequence[ThermalFrame], records: Sequence[Mapping[str, Any]]) -> None:
-        """Writes what belongs to the recording as a whole: frames.csv, temperature_bounds.json."""
+        """Writes what belongs to the recording as a whole: frames.csv, and temperature_bounds.json or .csv."""
         shutil.rmtree(self.target / PARTIAL, ignore_errors=True)
         write_csv(self.target / FRAMES_FILE, rows(frames, records))
         found = [
             r["quantiles"] for f, r in zip(frames, records, strict=True) if f.calibration is not None and r["quantiles"]
         ]
-        if found:
+        if spans := {image_name(frame): span_of(frame) for frame in frames if frame.span is not None}:
+            write_spans(self.target, spans)
+        elif found:
             low, high = min(q[0] for q in found), max(q[-1] for q in found)
             write_bounds(self.target, low, max(high, low + 1e-3))
         else:  # bounds of an earlier preparation would make temperatures of greys
-            (self.target / BOUNDS_FILE).unlink(missing_ok=True)
+            for name in (BOUNDS_FILE, BOUNDS_TABLE):
+                (self.target / name).unlink(missing_ok=True)
 
 
 def image_name(frame: ThermalFrame) -> str:
@@ -246,6 +249,21 @@ def write_bounds(target: Path, low: float, high: float) -> None:
     """Says in a prepared folder between which temperatures in °C its images lie."""
     bounds = {"absolute_min_temperature": low, "absolute_max_temperature": high}
     write_atomically(target / BOUNDS_FILE, json.dumps(bounds, indent=1) + "\n")
+    (target / BOUNDS_TABLE).unlink(missing_ok=True)  # of an earlier preparation
+
+
+def span_of(frame: ThermalFrame) -> tuple[float, float]:
+    """The surface temperatures in °C of black and white of a frame with a span of its own, under its conditions."""
+    white = round(frame.span.span_k / frame.calibration.scale)
+    low, high = surface_celsius(np.array([0.0, white]), frame.calibration, frame.conditions)
+    return float(low), float(high)
+
+
+def write_spans(target: Path, spans: Mapping[str, tuple[float, float]]) -> None:
+    """Says in a prepared folder between which temperatures in °C the camera drew each image, by its name: those at an end may be
+    beyond."""
+    write_csv(target / BOUNDS_TABLE, [{NAMES[0]: name, LOWER: low, UPPER: high} for name, (low, high) in spans.items()])
+    (target / BOUNDS_FILE).unlink(missing_ok=True)  # of an earlier preparation
 
 
 def uncertainty_at(

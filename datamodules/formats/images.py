@@ -7,7 +7,7 @@ import os
 import struct
 import unicodedata
 import zlib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -349,3 +349,24 @@ def resized_mask(mask: np.ndarray, width: int, height: int) -> np.ndarray:
     if mask.shape == (height, width):
         return mask
     return cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.999
+
+
+def undistorted_ends(ends: np.ndarray | None, lens: Lens) -> np.ndarray | None:
+    """Where the undistorted image was cut off, [H, W] int8 (``_touched``); None stays."""
+    if ends is None:
+        return None
+    x, y, _ = undistortion_maps(lens)
+    return _touched(ends, lambda share: cv2.remap(share, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def resized_ends(ends: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Where the resized image was cut off, [height, width] int8 (``_touched``)."""
+    if ends.shape == (height, width):
+        return ends
+    return _touched(ends, lambda share: cv2.resize(share, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def _touched(ends: np.ndarray, resample: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Which new pixels rest on pixels at an end of the image's span (1: warm, -1: cold), if on none at the other end."""
+    above, below = (resample((ends == sign).astype(np.float32)) > 1e-3 for sign in (1, -1))
+    return above.astype(np.int8) - below.astype(np.int8)

@@ -287,6 +287,8 @@ class View:
         mask: [H, W] bool, True where a pixel counts; None means that all do.
         clean: [H, W, C] what a camera without flaws and noise would have recorded, where that is known (synthetic
             scenes); nothing trains on it.
+        ends: [H, W] int8 of the thermal image: 1 where it was cut off at its warm end and the truth may lie above its value, -1
+            likewise at its cold end, 0 where the value is one; None means that all are.
     """
 
     frame: Frame
@@ -294,6 +296,7 @@ class View:
     rgb: Tensor | None = None
     mask: Tensor | None = None
     clean: Tensor | None = None
+    ends: Tensor | None = None
 
     @property
     def camera(self) -> Camera:
@@ -307,6 +310,13 @@ class View:
     def counts(self) -> bool:
         """Whether any of its pixels counts."""
         return self.mask is None or bool(self.mask.any())
+
+    @property
+    def known(self) -> Tensor | None:
+        """Which pixels [H, W] bool count and have a thermal value, and no mere bound of one; None means that all do."""
+        if self.ends is None:
+            return self.mask
+        return self.ends == 0 if self.mask is None else self.mask & (self.ends == 0)
 
     def image(self, modality: str) -> Tensor:
         """The image of a modality ("thermal" or "rgb"), [H, W, C]; "clean" is the thermal image where none is known.
@@ -322,7 +332,9 @@ class View:
     def to(self, device: torch.device | str, dtype: torch.dtype | None = None) -> View:
         """The same view with its images on ``device`` (cameras stay on the CPU; renderers move them), as ``dtype`` if given."""
         images = {
-            key: image for key in ("thermal", "rgb", "mask", "clean") if (image := getattr(self, key)) is not None
+            key: image
+            for key in ("thermal", "rgb", "mask", "clean", "ends")
+            if (image := getattr(self, key)) is not None
         }
         moved = {
             key: image.to(device, dtype if image.is_floating_point() else None, non_blocking=True)

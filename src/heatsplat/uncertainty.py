@@ -93,7 +93,7 @@ def _gathered(module: Any, view: View, maps: Tensor) -> Tensor:
         values = torch.zeros(len(module.splats), maps.shape[-1], device=module.device, requires_grad=True)
         seen = module.composited(view.frame, values)
         maps = seen.alpha[0].detach()[..., None] * maps
-        counted = maps.isfinite() if view.mask is None else maps.isfinite() & view.mask[..., None]
+        counted = maps.isfinite() if view.known is None else maps.isfinite() & view.known[..., None]
         (found,) = torch.autograd.grad((seen.features * maps.where(counted, 0.0)).sum(), values)
     return found.cpu().double().clamp(min=0.0)
 
@@ -406,7 +406,7 @@ class Uncertainty:
                 (self.module.predict(view.frame).cpu() - view.image(self.module.modality)).square().mean(-1).double()
             )
             rows = torch.cat([squares[..., None], self._variances(view.frame, stretches)], dim=-1).flatten(0, 1)
-            counted = rows.isfinite().all(1) if view.mask is None else rows.isfinite().all(1) & view.mask.reshape(-1)
+            counted = rows.isfinite().all(1) if view.known is None else rows.isfinite().all(1) & view.known.reshape(-1)
             # A copy, for a slice would keep the rows of the whole image in memory.
             found.append(rows[counted][:: _stride(every, view.frame.camera.width)].clone())
         return found

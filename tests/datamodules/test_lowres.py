@@ -1,5 +1,7 @@
 """Degraded scenes: half pixels, both grids, masks, what stays as it is, and input that cannot be reduced."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -127,3 +129,13 @@ def test_images_that_are_shrunk_first_can_be_divided():
     scene = Synthetic(scene="static", size="tiny", frames=9, downscale=4, degrade="lr4").scene  # of 64 x 52 pixels
     assert {(f.camera.width, f.camera.height) for f in scene.train.frames} == {(4, 3)}
     assert {(f.camera.width, f.camera.height) for f in scene.test.frames} == {(16, 12)}
+
+
+def test_what_was_cut_off_stays_known():
+    scene = make_scene()
+    ends = torch.zeros(HEIGHT, WIDTH, dtype=torch.int8)
+    ends[5, 9] = 1
+    cut = replace(scene, train=ViewSet(scene.train.frames, lambda i: replace(scene.train[i], ends=ends)))
+    assert degraded(cut, "lr4", None).train[0].ends.nonzero().tolist() == [[1, 2]]
+    assert degraded(cut, "lr4", "bicubic").train[0].ends.sum() == 16
+    assert degraded(scene, "lr4", None).train[0].ends is None

@@ -12,6 +12,7 @@ from heatsplat.datamodules.formats.nerfstudio import THERMAL_KEYS, VISIBLE_KEYS
 from heatsplat.datamodules.nerfstudio import Nerfstudio
 from heatsplat.datamodules.rhd import RHD
 from heatsplat.datamodules.thermo import Thermo
+from heatsplat.preparation.regions import read_regions
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "your_own_data.md").read_text()
@@ -27,6 +28,7 @@ def put(folder, *examples):
 def test_every_example_is_tried():
     tried = {
         "temperature_bounds.json",
+        "temperature_bounds.csv",
         "times.csv",
         "split.json",
         "transforms.json",
@@ -35,6 +37,7 @@ def test_every_example_is_tried():
         "info.json",
         "points.csv",
         "pixels.csv",
+        "regions.csv",
     }
     assert set(EXAMPLES) == tried
 
@@ -46,6 +49,19 @@ def test_the_colmap_example(tmp_path):
     assert (scene.thermal_range.min_c, scene.thermal_range.max_c) == (12.5, 48.0)
     assert scene.train.times_s == [0.0, 2.5] and scene.test.times_s == [5.0]
     assert [f.name for f in scene.test.frames] == FILES[2:]
+
+
+def test_the_example_of_a_span_for_each_image(tmp_path):
+    write_colmap(tmp_path, FILES)
+    put(tmp_path, "temperature_bounds.csv")
+    scene = Colmap(root=str(tmp_path)).scene
+    assert (scene.thermal_range.min_c, scene.thermal_range.max_c) == (11.9, 51.6)
+
+
+def test_the_example_of_regions(tmp_path):
+    put(tmp_path, "regions.csv")
+    regions = read_regions(tmp_path / "regions.csv")
+    assert [region.name for region in regions] == ["duct", "window", "tape on the duct"]
 
 
 def test_the_transforms_example(tmp_path):

@@ -64,9 +64,8 @@ def test_a_ball_of_gaussians_becomes_a_mesh_of_it_with_temperatures_and_a_pictur
     assert (tmp_path / "ball.png").stat().st_size > 1000
 
 
-def test_the_depth_is_that_of_the_surface_through_fog(cooling):
-    """Faint Gaussians between the cameras and a ball move the mean depth, and not that of its surface."""
-    ball, centre, radius = on_a_ball(cooling)
+def in_fog(ball, centre, radius, opacity=0.02):
+    """Faint Gaussians between the first camera and a ball."""
     seen, view = ball.seen, ball.module.scene.train[0]
     towards = torch.nn.functional.normalize(view.camera.center - centre, dim=0).float()
     fog = replace(
@@ -74,9 +73,15 @@ def test_the_depth_is_that_of_the_surface_through_fog(cooling):
         means=torch.cat([seen.means, seen.means + 1.5 * radius * towards]),
         quats=torch.cat([seen.quats] * 2),
         scales=torch.cat([seen.scales] * 2),
-        opacities=torch.cat([seen.opacities, torch.full((len(seen.means),), 0.02)]),
+        opacities=torch.cat([seen.opacities, torch.full((len(seen.means),), opacity)]),
     )
-    foggy = replace(ball, seen=fog, blended=torch.cat([ball.blended] * 2), values=torch.cat([ball.values] * 2))
+    return replace(ball, seen=fog, blended=torch.cat([ball.blended] * 2), values=torch.cat([ball.values] * 2))
+
+
+def test_the_depth_is_that_of_the_surface_through_fog(cooling):
+    """Faint Gaussians between the cameras and a ball move the mean depth, and not that of its surface."""
+    ball, centre, radius = on_a_ball(cooling)
+    foggy, view = in_fog(ball, centre, radius), ball.module.scene.train[0]
     sight = rays(view.camera)
     middle = to_camera(centre, view.camera.viewmat)
     a, b = sight.square().sum(-1), sight @ middle

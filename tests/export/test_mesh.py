@@ -5,10 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from plyfile import PlyData
+from test_made_surface import in_fog, on_a_ball
 
 from heatsplat.contracts import SceneError
+from heatsplat.export.formats import mesh
 from heatsplat.export.formats.mesh import Mesh
 
 trimesh = pytest.importorskip("trimesh")
@@ -21,15 +24,15 @@ def test_another_library_reads_what_was_written(cooling, tmp_path):
     plane.apply_translation(centre.numpy())
     plane.export(tmp_path / "given.obj")
     Mesh(f"{tmp_path}/given.obj", views=8, two_sided=True).write(cooling, tmp_path / "a.ply")
-    mesh = trimesh.load(str(tmp_path / "a.ply"), process=False)
+    found = trimesh.load(str(tmp_path / "a.ply"), process=False)
     given = trimesh.load(str(tmp_path / "given.obj"), process=False)
-    assert np.allclose(mesh.vertices, given.vertices) and np.array_equal(mesh.faces, given.faces)
+    assert np.allclose(found.vertices, given.vertices) and np.array_equal(found.faces, given.faces)
     values = PlyData.read(tmp_path / "a.ply")["vertex"]["temperature_c"]
     known = np.isfinite(values)
     assert 0 < known.sum() < len(values)
     low, high = scene.thermal_range.min_c, scene.thermal_range.max_c
     assert (values[known] >= low - 1).all() and (values[known] <= high + 1).all()
-    colours = mesh.visual.vertex_colors[:, :3]
+    colours = found.visual.vertex_colors[:, :3]
     assert set(map(tuple, colours[~known])) <= {(128, 128, 128), (176, 176, 176)}
     with Image.open(tmp_path / "a.png") as picture:
         assert min(picture.size) > 200
@@ -84,3 +87,27 @@ def test_why_most_vertices_have_no_temperature_is_said(cooling, tmp_path, caplog
     trimesh.util.concatenate([near, far]).export(tmp_path / "both.ply")
     Mesh(str(tmp_path / "both.ply"), views=4, two_sided=True).write(cooling, tmp_path / "a.ply")
     assert "most vertices have no temperature, as no view has them within 5 % of the distance" in caplog.text
+
+
+def test_vertices_of_a_given_mesh_have_temperatures_through_fog(cooling, tmp_path, monkeypatch):
+    """Faint Gaussians before a ball move its mean depth by more than 5 % of the distance, from some cameras on."""
+    ball, centre, radius = on_a_ball(cooling)
+    foggy = in_fog(ball, centre, radius, opacity=0.06)
+    sphere = trimesh.creation.icosphere(3, radius=radius)
+    sphere.apply_translation((centre + ball.module.scene.origin).numpy())
+    sphere.export(tmp_path / "ball.ply")
+    one = replace(foggy, module=SimpleNamespace(scene=_first_view(ball.module.scene), renderer=ball.module.renderer))
+    Mesh(str(tmp_path / "ball.ply")).write(one, tmp_path / "a.ply")
+    values = PlyData.read(tmp_path / "a.ply")["vertex"]["temperature_c"]
+    monkeypatch.setattr(mesh, "closest", lambda moment, view: (torch.zeros_like(moment.look(view).depth), None))
+    Mesh(str(tmp_path / "ball.ply")).write(one, tmp_path / "mean.ply")
+    by_mean = PlyData.read(tmp_path / "mean.ply")["vertex"]["temperature_c"]
+    known, before = np.isfinite(values), np.isfinite(by_mean)
+    assert (values[before] == by_mean[before]).all()
+    away = (sphere.vertices - (centre + ball.module.scene.origin).numpy())[:, 0] / radius
+    truth = ball.of_blended(torch.from_numpy(0.5 + 0.3 * away)).numpy()
+    assert known.sum() > 1.5 * before.sum() and np.abs(values - truth)[known].mean() < 0.05 * np.ptp(truth)
+
+
+def _first_view(scene):
+    return replace(scene, train=scene.train.subset([0]))

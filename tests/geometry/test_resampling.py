@@ -8,7 +8,15 @@ from hypothesis import strategies as st
 from PIL import Image
 from torch.nn import functional
 
-from heatsplat.geometry.resampling import KERNELS, resampled, scale_between, valid_after, weights
+from heatsplat.geometry.resampling import (
+    KERNELS,
+    ends_on,
+    resampled,
+    scale_between,
+    valid_after,
+    weights,
+    with_what_lies_beyond,
+)
 
 
 def noise(height, width, channels=1, seed=0):
@@ -111,3 +119,26 @@ def test_errors():
         resampled(noise(4, 4), 2, 2, "cubic")
     with pytest.raises(ValueError, match="a line of 4 pixels cannot become one of 0"):
         resampled(noise(4, 4), 0, 2)
+
+
+def test_a_coarse_pixel_was_cut_off_where_one_below_it_was():
+    ends = torch.zeros(4, 6, dtype=torch.int8)
+    ends[0, 0], ends[1, 2], ends[2, 4], ends[3, 5] = 1, -1, 1, -1
+    assert ends_on(ends, 2, 3).tolist() == [[1, -1, 0], [0, 0, 0]]  # the last has both
+    assert ends_on(ends, 4, 6) is ends and ends_on(None, 2, 3) is None
+    assert torch.equal(ends_on(ends, 8, 12), ends.repeat_interleave(2, 0).repeat_interleave(2, 1))
+
+
+@pytest.mark.parametrize("finer", [1, 2])
+def test_beyond_what_was_cut_off_a_prediction_is_right_and_has_no_gradient(finer):
+    target = torch.full((2, 3, 1), 0.5)
+    ends = torch.tensor([[1, 1, 0], [-1, -1, 0]], dtype=torch.int8)
+    values = torch.tensor([[0.7, 0.3, 0.7], [0.3, 0.7, 0.3]])[..., None]
+    prediction = values.repeat_interleave(finer, 0).repeat_interleave(finer, 1).requires_grad_()
+    told = with_what_lies_beyond(target, ends, prediction)
+    expected = torch.tensor([[0.7, 0.5, 0.5], [0.3, 0.5, 0.5]])[..., None]
+    assert torch.allclose(told, expected) and not told.requires_grad
+    (resampled(prediction, 2, 3, "area") - told).abs().sum().backward()
+    moved = resampled(prediction.grad, 2, 3, "area")[..., 0] != 0
+    assert moved.tolist() == [[False, True, True], [False, True, True]]
+    assert with_what_lies_beyond(target, None, prediction) is target

@@ -10,7 +10,7 @@ from camera_files import dji_jpeg, raw_for, temperatures, with_segment
 from PIL import Image
 from recordings import START, STATED, read_frames, write_flir, write_images, write_sequence
 
-from heatsplat.contracts import SceneError, as_written
+from heatsplat.contracts import SceneError, ThermalRange, as_written
 from heatsplat.datamodules.formats.palette import named
 from heatsplat.preparation import frames
 from heatsplat.preparation.fingerprint import fingerprint
@@ -441,3 +441,101 @@ def test_photos_that_temperatures_explain_in_part_are_photos(tmp_path):
         picture[:, 12:] = np.random.default_rng(0).integers(0, 255, (18, 8, 3), np.uint8)
         write_images(tmp_path, {f"{name}.tiff": values, f"{name}.png": picture})
     assert [frame.rgb.name for frame in read_frames(tmp_path)] == ["IR_0001.png", "IR_0002.png"]
+
+
+# A span of its own for every image ----------------------------------------------------------------------------------
+
+SPAN_COLUMNS = {"name": "file", "time": "time", "min_c": "min_c", "max_c": "max_c"}
+
+
+def truth(index):
+    """°C [H, W] of a frame: a slope, and a spot that is warmer in every frame."""
+    y, x = np.mgrid[:24, :32]
+    return 10.0 + 0.3 * x + 0.2 * y + (4.0 + 3.0 * index) * np.exp(-((x - 8 - 4 * index) ** 2 + (y - 10) ** 2) / 20.0)
+
+
+def greys(index, ends, dtype=np.uint8):
+    full = np.iinfo(dtype).max
+    return np.rint(np.clip((truth(index) - ends[0]) / (ends[1] - ends[0]), 0, 1) * full).astype(dtype)
+
+
+def spans_of_five(cut=0.0):
+    """Ends that an automatic range takes, to a tenth of a degree."""
+    return [tuple(np.quantile(truth(i), [cut, 1 - cut]).round(1)) for i in range(5)]
+
+
+def write_table(folder, spans, names=None, head="file,min_c,max_c"):
+    names = names or [f"f{i}" for i in range(len(spans))]
+    rows = [f"{name},{low},{high}" for name, (low, high) in zip(names, spans, strict=True)]
+    path = folder / "spans.csv"
+    path.write_text("\n".join([head, *rows]))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["grey", "grey16", "colour"])
+def test_images_of_a_span_each_are_the_truth_to_half_a_step(tmp_path, kind):
+    spans, dtype = spans_of_five(), np.uint16 if kind == "grey16" else np.uint8
+    drawn = {f"f{i}.png": greys(i, ends, dtype) for i, ends in enumerate(spans)}
+    palette = "iron" if kind == "colour" else None
+    if palette:
+        drawn = {name: coloured(levels) for name, levels in drawn.items()}
+    source = write_images(tmp_path / "files", drawn)
+    reading = Reading(table=write_table(tmp_path, spans), columns=SPAN_COLUMNS, palette=palette)
+    found = read_recording(source, reading)
+    full, lows, highs = np.iinfo(dtype).max, *zip(*spans, strict=True)
+    for i, frame in enumerate(found.frames):
+        (low, high), celsius = spans[i], frame.temperature()
+        half = (1.5 if palette else 0.5) * (high - low) / full + 1e-5
+        within = (truth(i) >= low) & (truth(i) <= high)
+        assert within.mean() > 0.95 and np.abs(celsius - truth(i))[within].max() <= half
+        assert frame.span == ThermalRange(low, high)
+    assert any(
+        f"greys of {min(lows):g} .. {max(highs):g} °C by spans.csv: each image has" in note for note in found.notes
+    )
+    assert any("spans.csv tells max_c, min_c of 5 of 5 frames" in note for note in found.notes)
+
+
+def test_tables_of_spans_that_do_not_fit_are_refused(tmp_path):
+    spans = spans_of_five()
+    source = write_images(tmp_path / "files", {f"f{i}.png": greys(i, ends) for i, ends in enumerate(spans)})
+
+    def refused(message, written=spans, names=None, head="file,min_c,max_c", **more):
+        reading = Reading(table=write_table(tmp_path, written, names, head), columns=SPAN_COLUMNS, **more)
+        with pytest.raises(SceneError, match=message):
+            read_recording(source, reading)
+
+    refused(r"no min_c and max_c of 1 frame of 5, such as f4.png: add them, or take these files out", spans[:4])
+    refused(r"no min_c and max_c of 1 frame of 5, such as f2.png", [*spans[:2], ("", ""), *spans[3:]])
+    refused(
+        r"spans.csv, line 4: the minimum 30.0 °C lies above the maximum 2.0 °C; swap", [*spans[:2], (30, 2), *spans[3:]]
+    )
+    refused(r"spans.csv, line 4: the maximum '' is no number", [*spans[:2], (30, ""), *spans[3:]])
+    refused(r"has a column min_c and none max_c: .* as in table_columns.max_c=most", head="file,min_c,most")
+    refused(r"bounds_c is one span for all images, and table=.* has one for each", meaning=Meaning(bounds_c=[0.0, 9.0]))
+
+
+def test_rows_of_no_frame_are_warned_of(tmp_path, caplog):
+    spans = spans_of_five()
+    source = write_images(tmp_path / "files", {f"f{i}.png": greys(i, ends) for i, ends in enumerate(spans[:3])})
+    read_frames(source, Reading(table=write_table(tmp_path, spans), columns=SPAN_COLUMNS))
+    assert "2 rows of no frame, such as f3, f4" in caplog.text
+
+
+def test_files_that_hold_temperatures_need_no_spans(tmp_path):
+    """Minima and maxima of such files stand in tables, too, and are what they show."""
+    spans = spans_of_five()
+    table = write_table(tmp_path, spans)
+    kelvin = {f"f{i}.png": np.rint(100 * (truth(i) + 273.15)).astype(np.uint16) for i in range(5)}
+    for name, images in (("float", {f"f{i}.tiff": truth(i).astype(np.float32) for i in range(5)}), ("counts", kelvin)):
+        found = read_recording(write_images(tmp_path / name, images), Reading(table=table, columns=SPAN_COLUMNS))
+        np.testing.assert_allclose(found.frames[2].temperature(), truth(2), atol=6e-3)
+        assert any("min_c and max_c are not used, as the files hold temperatures" in note for note in found.notes)
+
+
+def test_greys_beside_a_table_of_spans_name_it(tmp_path):
+    source = write_images(tmp_path, {"f0.png": greys(0, (0, 50))})
+    (tmp_path / "temperature_bounds.csv").write_text("file,min_c,max_c\nf0.png,0,50\n")
+    notes = read_recording(source).notes
+    assert any(
+        f"table={tmp_path / 'temperature_bounds.csv'}, with the span of each image, would give them" in n for n in notes
+    )

@@ -34,7 +34,7 @@ def test_a_table_goes_before_the_files(tmp_path):
     with pytest.raises(SceneError, match="no column 'utc', as table_columns.time says; it has file, when, lat, lon"):
         read_frames(tmp_path / "frames", Reading(table=table, columns=columns | {"time": "utc"}))
     with pytest.raises(
-        SceneError, match="table_columns.heading=yaw: a table tells name, time, .* roll_deg, no heading"
+        SceneError, match="table_columns.heading=yaw: a table tells name, time, .* roll_deg, min_c, max_c, no heading"
     ):
         read_frames(tmp_path / "frames", Reading(table=table, columns=columns | {"heading": "yaw"}))
     table.write_text("file;when;lat;lon\na;yesterday;50,5;7,5\n")

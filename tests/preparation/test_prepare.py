@@ -114,6 +114,17 @@ def test_pictures_in_false_colours_become_temperatures_between_bounds(tmp_path):
     np.testing.assert_allclose(turned[4:], 51 - levels[4:] / 5.0, atol=0.21)
 
 
+def test_the_doctor_takes_images_that_were_made_of_colours_for_temperatures(tmp_path):
+    levels = [np.clip(8 * temperatures() + i, 0, 255).astype(np.uint8) for i in range(9)]
+    colours = {
+        f"f{i}.png": np.rint(named("iron").curve(256)[image]).astype(np.uint8)[..., ::-1]
+        for i, image in enumerate(levels)
+    }
+    source, given = write_images(tmp_path / "files", colours), {"bounds_c": [0.0, 51.0], "palette": "iron"}
+    page = prepare(str(source), tmp_path / "scene", **PLAIN, **given, poses=poses, doctor=section)
+    assert "Doctor, with the cameras" in page.with_suffix(".md").read_text()
+
+
 def test_conditions_that_are_given_change_the_temperatures(tmp_path):
     source = write_flir(tmp_path / "files", 2)
     prepare(str(source), tmp_path / "a", **PLAIN)
@@ -224,3 +235,49 @@ def test_a_grey_without_temperatures_and_cameras_is_not_said_to_be_temperatures(
     with pytest.raises(SceneError, match=r"1 frame cannot tell .*\. The images are in .*scene/images all the same"):
         prepare(str(source), tmp_path / "scene", **PLAIN, poses=FindPoses(Sift(most=200)))
     assert (tmp_path / "scene" / "images" / "a.png").is_file()
+
+
+def test_greys_and_colours_of_a_span_each_become_a_scene_in_celsius(tmp_path):
+    """What one span for all would tell wrong by degrees comes back to half a step of each image's own; so it does to training."""
+    spans, columns = (
+        [(10.0 + i, 30.0 + 3.0 * i) for i in range(9)],
+        {"name": "file", "min_c": "min_c", "max_c": "max_c"},
+    )
+    seen = [temperatures() * (1.0 + 0.1 * i) for i in range(9)]
+    shown = [np.clip(image, low, high) for image, (low, high) in zip(seen, spans, strict=True)]
+    levels = [
+        np.rint((image - low) / (high - low) * 255).astype(np.uint8)
+        for image, (low, high) in zip(shown, spans, strict=True)
+    ]
+    table = tmp_path / "spans.csv"
+    table.write_text("file;min_c;max_c\n" + "".join(f"f{i};{a};{b}\n" for i, (a, b) in enumerate(spans)))
+    given = {**PLAIN, "table": str(table), "table_columns": columns, "poses": poses, "doctor": section}
+    for name, palette in (("greys", None), ("colours", "iron")):
+        drawn = {
+            f"f{i}.png": np.rint(named("iron").curve(256)[image]).astype(np.uint8)[..., ::-1] if palette else image
+            for i, image in enumerate(levels)
+        }
+        target = tmp_path / f"scene_{name}"
+        prepare(str(write_images(tmp_path / name, drawn)), target, palette=palette, **given)
+        for i, (low, high) in enumerate(spans):
+            written = read_temperature(target / "images" / f"f{i}.tiff")
+            half = (1.5 if palette else 0.5) * (high - low) / 255 + 1e-4
+            assert np.abs(written - shown[i]).max() <= half
+            record = json.loads((target / "images" / f"f{i}.json").read_text())
+            assert record["calibration"]["offset_c"] == low and record["unknown_pixels"] == 0
+        assert not (target / "temperature_bounds.json").exists()
+        scene = Colmap(root=str(target)).scene
+        assert (scene.thermal_range.min_c, scene.thermal_range.max_c) == pytest.approx((10.0, 54.0))
+        view = next(v for v in scene.train if v.frame.name == "f3.tiff")
+        celsius = scene.thermal_range.to_celsius(view.thermal[..., 0].numpy())
+        assert np.abs(celsius - shown[3]).max() <= 1.5 * (spans[3][1] - spans[3][0]) / 255
+        assert (view.ends.numpy()[seen[3] > spans[3][1]] == 1).all() and (seen[3] > spans[3][1]).any()
+        assert (view.ends.numpy()[seen[3] < spans[3][0]] == -1).all()
+    images = tmp_path / "scene_greys" / "images"
+    before = [(images / f"f{i}.json").stat().st_mtime_ns for i in (7, 8)]
+    table.write_text(table.read_text().replace("f8;18.0;54.0", "f8;18.0;50.0"))
+    prepare(str(tmp_path / "greys"), tmp_path / "scene_greys", **given)
+    after = [(images / f"f{i}.json").stat().st_mtime_ns for i in (7, 8)]
+    assert after[0] == before[0] and after[1] > before[1]  # another span makes other temperatures
+    page = prepare(str(tmp_path / "greys"), tmp_path / "scene_greys", **PLAIN, bounds_c=[10.0, 50.0])
+    assert (page.parent / "temperature_bounds.json").exists() and not (page.parent / "temperature_bounds.csv").exists()

@@ -14,7 +14,8 @@ CAMERA = Camera(torch.eye(4), torch.tensor([[11.0, 0.0, 6.3], [0, 12.0, 4.1], [0
 
 def view() -> View:
     pixels = torch.arange(9 * 13.0).view(9, 13, 1)
-    return View(Frame("one", 0, CAMERA), pixels, pixels.expand(9, 13, 3), pixels[..., 0] > 5)
+    below = pixels[..., 0] > 5
+    return View(Frame("one", 0, CAMERA), pixels, pixels.expand(9, 13, 3), below, ends=below.to(torch.int8))
 
 
 def test_pixels_that_are_taken_keep_their_lines_of_sight():
@@ -27,6 +28,7 @@ def test_pixels_that_are_taken_keep_their_lines_of_sight():
         starts.add(int(taken[0]))
         assert torch.allclose(rays(part.camera).view(-1, 3), sight.view(-1, 3)[taken])
         assert torch.equal(part.rgb[..., 0], part.thermal[..., 0]) and torch.equal(part.mask, part.thermal[..., 0] > 5)
+        assert torch.equal(part.ends > 0, part.mask)
     assert len(starts) == 9 and {start % 13 for start in starts} == {0, 1, 2}  # stride 3
 
 

@@ -215,6 +215,16 @@ def test_cameras_of_targets_see_the_same_directions():
     assert torch.allclose(small_place / torch.tensor([111.0, 137.0]), place / torch.tensor([333.0, 410.0]))
 
 
+def test_coarse_targets_know_where_images_were_cut_off():
+    schedule = prepared(CoarseToFine(), white(128))
+    view = schedule._scene.train[0]
+    ends = torch.zeros(128, 128, dtype=torch.int8)
+    ends[5, 9], ends[100, 4] = 1, -1
+    small = schedule.reduced(replace(view, ends=ends), 2.0)
+    assert small.ends.nonzero().tolist() == [[2, 4], [50, 2]] and small.ends.sum() == 0
+    assert small.known.sum() == 64 * 64 - 2
+
+
 def test_targets_are_kept_while_the_ratio_stays_and_no_more_than_fit(monkeypatch):
     schedule = prepared(CoarseToFine(), *(white(128, seed) for seed in range(3)))
     first, second, third = schedule._scene.train

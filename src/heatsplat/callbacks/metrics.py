@@ -11,6 +11,7 @@ from torch import Tensor
 
 from heatsplat.callbacks.board import add_scalars
 from heatsplat.contracts import SceneData, SceneError, check_option
+from heatsplat.geometry.resampling import with_what_lies_beyond
 from heatsplat.io.results import CURVE_FILE
 from heatsplat.io.tables import write_csv
 from heatsplat.metrics.definitions import DEFINITIONS, IMAGE_SCORES
@@ -94,13 +95,18 @@ class QualityMetrics(pl.Callback):
         frame = view.frame
         row = {"name": frame.name, "frame_id": frame.frame_id, "time_s": frame.time_s, "seconds": outputs["seconds"]}
         target = view.image(module.modality)
+        if module.modality == "thermal":
+            target = with_what_lies_beyond(target, view.ends, prediction)
         row |= self._scorer(prediction, target, view.mask)
         counted = target if view.mask is None else target[view.mask]
         self._empty += counted.numel() > 0 and bool((counted == counted.flatten()[0]).all())
         companions = outputs.get("companions", {})
         for modality, image in companions.items():
             scorer = self._scorer if modality == "clean" else self._image_scorer
-            scores = scorer(image, view.image(modality), view.mask)
+            target = view.image(modality)
+            if modality == "clean" and view.clean is None:  # the recorded image
+                target = with_what_lies_beyond(target, view.ends, image)
+            scores = scorer(image, target, view.mask)
             row |= {f"{modality}_{name}": scores[name] for name in _scores_of(modality)}
         self._companions = tuple(companions)
         self._rows.append(row)

@@ -75,7 +75,7 @@ class Plateau(pl.Callback):
         prediction, image = outputs["prediction"], view.image(module.modality)
         if view.counts and len(prediction) >= len(image):  # a coarse start tells nothing of full size
             total, visits = self._now.get(view.frame.frame_id, (0.0, 0))
-            error = squared_error(prediction, image, view.mask)
+            error = squared_error(prediction, image, view.known)
             self._now[view.frame.frame_id] = (total + error, visits + 1)
         tenth = max(1, round(schedule.steps / 10))
         if step % tenth:

@@ -275,7 +275,7 @@ def recorded(probe: Probe, scene: SceneData, modality: str) -> tuple[list[float]
         column, row = (int(x) for x in frame.camera.project(probe.point[None])[0][0].tolist())
         view = scene.train[i]
         value = view.image(modality)[row, column].mean().item()
-        if np.isfinite(value) and (view.mask is None or bool(view.mask[row, column])):
+        if np.isfinite(value) and (view.known is None or bool(view.known[row, column])):
             times.append(frame.time_s)
             values.append(value)
     return times, values

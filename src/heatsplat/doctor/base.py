@@ -15,7 +15,7 @@ from torch.nn import functional
 from heatsplat.contracts import Camera, Frame, SceneData, View
 from heatsplat.effects.observations import Tracks, difference_told, frames_to_follow, read, tracks_of
 from heatsplat.effects.weather_record import QUICK_PER_S, SLOW_PER_S, drivers
-from heatsplat.physics.noise import noise_of, quantum_of
+from heatsplat.physics.noise import noise_of, usual_quantum
 
 # Frames that are looked at: enough to find what is common, and cheap beside a training.
 MAX_FRAMES = 32
@@ -113,8 +113,7 @@ class Material:
     @cached_property
     def noise(self) -> float:
         """Standard deviation of a pixel's noise, in units of ``images``."""
-        first = self.known(0)
-        return noise_of(self.images, quantum_of(first), self.masks)
+        return noise_of(self.images, usual_quantum(self.images, self.masks), self.masks)
 
     @cached_property
     def contrast(self) -> float:

@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from heatsplat.contracts import Camera, Frame, SceneData, View, ViewSet, evenly_spread
 from heatsplat.geometry.projection import to_camera, to_pixels
-from heatsplat.physics.noise import noise_of, noise_of_repeats, quantum_of
+from heatsplat.physics.noise import noise_of, noise_of_repeats, usual_quantum
 
 MAX_FRAMES = 64
 ENOUGH = 0.5  # share of the points that a choice of frames shows at all which have to be followed through some of them
@@ -121,7 +121,7 @@ def observe(scene: SceneData) -> Observations:
     times = [frame.time_s for frame in frames]
     times_s = None if any(t is None for t in times) else torch.tensor(times, dtype=torch.float64)
     still = len(frames) > 1 and _stands_still(cameras, scene.points.double())
-    step = max(quantum_of(images[i] if masks is None else images[i][masks[i]]) for i in (0, -1))
+    step = usual_quantum(images, masks)
     noise = noise_of(images, step, masks)
     if still:
         noise = max(noise_of_repeats(images, masks), step / math.sqrt(12.0), 1e-6)
@@ -176,9 +176,9 @@ def read(
         if not made:
             images = torch.empty(len(chosen), *view.thermal.shape[:2])
         images[len(made)] = view.thermal.mean(2)
-        if view.mask is not None:
+        if (known := view.known) is not None:
             masks = torch.ones(images.shape, dtype=torch.bool) if masks is None else masks
-            masks[len(made)] = view.mask
+            masks[len(made)] = known
         made.append(make(i, view))
     return made, images[: len(made)], None if masks is None else masks[: len(made)]
 

@@ -14,7 +14,7 @@ from torch.nn import functional
 from heatsplat.contracts import Camera, SceneData, View, evenly_spread
 from heatsplat.effects.observations import standardised
 from heatsplat.geometry.projection import to_camera, to_world
-from heatsplat.physics.noise import noise_of, quantum_of
+from heatsplat.physics.noise import noise_of, usual_quantum
 
 log = logging.getLogger(__name__)
 
@@ -59,8 +59,8 @@ def swept_points(scene: SceneData) -> Tensor:
         return none
     noise = 0.0
     if len({image.shape for image in images}) == 1:
-        known = torch.stack(images).isfinite()
-        noise = noise_of(torch.stack(images).nan_to_num(), quantum_of(images[0][known[0]]), known)
+        stacked = torch.stack(images)
+        noise = noise_of(stacked.nan_to_num(), usual_quantum(stacked), stacked.isfinite())
     middle = scene.points.double().mean(0)
     found = [none]
     for k in evenly_spread(len(images), REFERENCES):
@@ -72,8 +72,8 @@ def swept_points(scene: SceneData) -> Tensor:
 
 def _shrunk(view: View) -> Tensor:
     image = view.thermal.mean(2).double()
-    if view.mask is not None:
-        image = torch.where(view.mask, image, torch.nan)
+    if (known := view.known) is not None:
+        image = torch.where(known, image, torch.nan)
     return functional.avg_pool2d(image[None, None], _block(view.camera))[0, 0]
 
 

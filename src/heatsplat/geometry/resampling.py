@@ -103,6 +103,35 @@ def weights(count: int, new_count: int, kernel: str) -> Tensor:
     return found / found.sum(1, keepdim=True)
 
 
+def ends_on(ends: Tensor | None, height: int, width: int) -> Tensor | None:
+    """Where an image on ``height`` x ``width`` pixels was cut off, [height, width] int8, None stays: a pixel is that covers one
+    which was, if none of them was at the other end.
+
+    Args:
+        ends: [H, W] of the image (``View.ends``).
+    """
+    if ends is None or ends.shape == (height, width):
+        return ends
+    above, below = (resampled((ends == sign)[..., None].float(), height, width, "area")[..., 0] > 0 for sign in (1, -1))
+    return above.to(torch.int8) - below.to(torch.int8)
+
+
+def with_what_lies_beyond(target: Tensor, ends: Tensor | None, prediction: Tensor) -> Tensor:
+    """The target [H, W, C] of a prediction that may lie beyond what it was cut off at: there the prediction itself, without a
+    gradient, so that the two do not differ. The target as it is where ``ends`` is None.
+
+    Args:
+        target: [H, W, C].
+        ends: [H, W], where it was cut off (``View.ends``).
+        prediction: [H', W', C], on the grid of the target or on a finer one.
+    """
+    if ends is None:
+        return target
+    there = resampled(prediction.detach(), *target.shape[:2], "area")
+    ends = ends[..., None]
+    return torch.where(((ends > 0) & (there > target)) | ((ends < 0) & (there < target)), there, target)
+
+
 def scale_between(fine: tuple[int, int], coarse: tuple[int, int]) -> int | None:
     """The whole number by which a grid (height, width) is finer than another; None where there is none."""
     factor = fine[0] // max(coarse[0], 1)

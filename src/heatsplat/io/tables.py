@@ -26,6 +26,8 @@ SPELLINGS = {
     "yaw_deg": ("yaw_deg", "yaw"),
     "pitch_deg": ("pitch_deg", "pitch"),
     "roll_deg": ("roll_deg", "roll"),
+    "min_c": ("min_c",),
+    "max_c": ("max_c",),
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 
 import torch
 from torch import Tensor
@@ -24,17 +25,20 @@ _UNIFORM = 1.0 / math.sqrt(12.0)
 def noise_of_views(views: ViewSet, modality: str) -> float:
     """Standard deviation of the noise of a pixel in the images of a modality, in image units, from a few of the views.
 
-    The median over these views of ``noise_of`` their first channel; quantisation counts as in the first of them. Views of
-    which no pixel counts tell nothing; of such alone it is ``MIN_NOISE``.
+    The median over these views of ``noise_of`` their first channel, each by its own quantisation. Views of which no pixel counts
+    tell nothing; of such alone it is ``MIN_NOISE``.
     """
     few = [views[i] for i in evenly_spread(len(views), _NOISY_VIEWS)]
     few = [view for view in few if view.counts]
     if not few:
         return MIN_NOISE
     images = [view.image(modality)[None, ..., 0].double() for view in few]
-    masks = [None if view.mask is None else view.mask[None] for view in few]
-    step = quantum_of(images[0] if masks[0] is None else images[0][masks[0]])
-    single = [noise_of(image, step, mask) for image, mask in zip(images, masks, strict=True)]
+    known = [view.known if modality == "thermal" else view.mask for view in few]
+    masks = [None if one is None else one[None] for one in known]
+    single = [
+        noise_of(image, quantum_of(image if mask is None else image[mask]), mask)
+        for image, mask in zip(images, masks, strict=True)
+    ]
     return float(torch.tensor(single, dtype=torch.float64).median())
 
 
@@ -83,6 +87,16 @@ def quantum_of(image: Tensor) -> float:
     gaps = levels.diff()
     gaps = gaps[gaps > 1e-7]  # float32 rounding of one level is no step
     return float(gaps.min()) if len(gaps) else 0.0
+
+
+def usual_quantum(images: Tensor, masks: Tensor | None = None) -> float:
+    """The quantisation of images [F, H, W] in image units, which differs where each has a span of its own: the median of those of
+    a few of them, without pixels that are NaN or do not count by ``masks`` [F, H, W]; 0 of none."""
+    found = []
+    for f in evenly_spread(len(images), _NOISY_VIEWS):
+        known = images[f].isfinite()
+        found.append(quantum_of(images[f][known if masks is None else known & masks[f]]))
+    return statistics.median_high(found) if found else 0.0
 
 
 def _whole(mask: Tensor) -> Tensor:

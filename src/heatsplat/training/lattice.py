@@ -37,7 +37,7 @@ class Lattice(Resolution):
         stride = max(1, math.ceil(math.sqrt(camera.width * camera.height / self.rays) - 1e-9))
         stride = min(stride, camera.width, camera.height)
         left, top = torch.randint(stride, (2,), generator=generator_for(seed, step, "lattice")).tolist()
-        images = {name: getattr(view, name) for name in ("thermal", "rgb", "mask", "clean")}
+        images = {name: getattr(view, name) for name in ("thermal", "rgb", "mask", "clean", "ends")}
         taken = {name: image[top::stride, left::stride] for name, image in images.items() if image is not None}
         return replace(view, frame=replace(view.frame, camera=_sparse(camera, stride, left, top)), **taken)
 

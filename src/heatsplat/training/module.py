@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
 from heatsplat.density.base import DensityChange, DensityControl, Merging
 from heatsplat.density.ops import Cloud
+from heatsplat.geometry.resampling import with_what_lies_beyond
 from heatsplat.io.results import RunResults
 from heatsplat.losses.compose import Loss, LossInputs, known_target, pixel_errors, summands
 from heatsplat.renderers.settings import Renderer
@@ -308,9 +309,12 @@ class SplatTraining(SceneModel):
             camera=self.cameras.of(frame, progress),
         )
         image, *companions = self._images(output)
+        prediction, target = self.sensor(image, frame, output.seen_depth), view.image(self.modality)
+        if self.modality == "thermal":
+            target = with_what_lies_beyond(target, view.ends, prediction)
         inputs = LossInputs(
-            prediction=self.sensor(image, frame, output.seen_depth),
-            target=view.image(self.modality),
+            prediction=prediction,
+            target=target,
             mask=view.mask,
             view=view,
             splats=self.splats,

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera, SceneData, View, evenly_spread
-from heatsplat.geometry.resampling import resampled
+from heatsplat.geometry.resampling import ends_on, resampled
 from heatsplat.geometry.spectrum import held, spectrum
 from heatsplat.sensors.base import Composite
 
@@ -118,7 +118,9 @@ class Growing(Resolution, ABC):
         found = self._kept.get(view.frame.frame_id)
         if found is None:
             found = self._made(view, rendered(view.camera, self._finer / ratio))
-            size = sum(image.nbytes for image in (found.thermal, found.rgb, found.mask) if image is not None)
+            size = sum(
+                image.nbytes for image in (found.thermal, found.rgb, found.mask, found.ends) if image is not None
+            )
             if self._kept_bytes + size <= KEPT_BYTES:
                 self._kept[view.frame.frame_id] = found
                 self._kept_bytes += size
@@ -135,7 +137,8 @@ class Growing(Resolution, ABC):
             images[name], mask = area_average(image, view.mask, camera.height, camera.width)
         if own in images:
             images[own] = self._composite.decode(images[own], images[own].shape[-1])
-        return replace(view, frame=replace(view.frame, camera=camera), mask=mask, clean=None, **images)
+        ends = ends_on(view.ends, camera.height, camera.width)
+        return replace(view, frame=replace(view.frame, camera=camera), mask=mask, clean=None, ends=ends, **images)
 
 
 class CoarseToFine(Growing):

@@ -259,8 +259,8 @@ class SceneModel(pl.LightningModule):
         output = self.render(view.frame, self.sensor.needs_depth, camera=camera)
         image = self.sensor(self._images(output)[0], view.frame, output.seen_depth)
         target = view.image(self.modality)
-        if view.mask is not None:
-            counts = view.mask.clone()  # autograd keeps no tensor of Lightning's inference mode
+        if (known := view.known) is not None:
+            counts = known.clone()  # autograd keeps no tensor of Lightning's inference mode
             image, target = image[counts], target[counts]
         return (image - target).square().mean()
 

@@ -36,8 +36,9 @@ def find(material: Material) -> list[Finding]:
             0.5 if gains is None else min(1.0, 2.0 * gains + 0.1),
             f"The images have temperature bounds, but {' and '.join(said)}: the camera adjusted them (AGC), and greys are no "
             "temperatures.",
-            "Export radiometric files (16 bits, TIFF, R-JPEG) or switch AGC off; of video that is all there is, take the bounds "
-            "away and let method=auto simulate agc.",
+            "Export radiometric files (16 bits, TIFF, R-JPEG) or switch AGC off; where the ends of each image are known, give "
+            "each its own span (temperature_bounds.csv, or table= of prepare.py); of video that is all there is, take the "
+            "bounds away and let method=auto simulate agc.",
         )
     ]
 
