@@ -178,7 +178,7 @@ def test_late_pruning_of_all_is_refused():
 
 def scene_of(count: int):
     image = torch.full((8, 8, 1), 0.5)
-    view = SimpleNamespace(image=lambda modality: image, mask=None, counts=True)
+    view = SimpleNamespace(image=lambda modality: image, mask=None, known=None, counts=True)
     return SimpleNamespace(name="few", train=[view] * count)
 
 
