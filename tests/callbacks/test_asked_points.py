@@ -18,7 +18,7 @@ class Deep(FakeModule):
 
     cameras = SimpleNamespace(of=lambda frame: frame.camera)
 
-    def depth(self, frame):
+    def surface(self, frame):
         return torch.full((frame.camera.height, frame.camera.width), 4.0)
 
 

@@ -809,6 +809,23 @@ def test_a_box_on_the_picture_becomes_one_in_the_scene_around_what_it_shows(page
     assert page.execute_script("return viewer.areas.corners(viewer.areas.list[0])") == [None] * 6
 
 
+@pytest.mark.parametrize(
+    ("depths", "weights", "found"),
+    [
+        (
+            [1, 2, 4, 4.1, 4.2, 9],
+            [0.05, 0.05, 0.15, 0.3, 0.15, 0.3],
+            4.1,
+        ),  # neither fog nor what lies behind moves the surface
+        ([1, 3, 8], [0.1, 0.5, 0.4], 3),
+        ([2, 3], [0.02, 0.02], 2),  # faint ones count by their share
+        ([], [], None),  # Infinity
+    ],
+)
+def test_a_surface_lies_where_weights_lie_closest(page, depths, weights, found):
+    assert page.execute_script(f"return closestDepth({depths}, {weights})") == found
+
+
 def test_pixels_without_a_surface_do_not_count_in_a_box(page):
     page.execute_script("viewer.goTo(0); viewer.nearer(-12)")
     keys(page, "m", "\ue007")  # Enter

@@ -211,7 +211,7 @@ def asked_probes(asked: Sequence[AskedPoint], module: pl.LightningModule) -> lis
     none sees are left out, and the log names them."""
     scene, probes, places, names, unseen = module.scene, [], [], [], []
     for one in asked:
-        place = one.placed(module.depth, module.cameras.of)
+        place = one.placed(module.surface, module.cameras.of)
         if place is None:
             unseen.append(one.name)
         elif one.frame is not None:

@@ -5,27 +5,19 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from heatsplat.contracts import SceneError, View, counted, quantile
 from heatsplat.export.moment import Moment
-from heatsplat.geometry.coverage import Sighting, surface_depth
+from heatsplat.geometry.closest_depth import closest_depth
+from heatsplat.geometry.coverage import Sighting
 from heatsplat.geometry.fusion import Surface, TooLarge, blocks_near, footprint, fuse
-from heatsplat.geometry.projection import to_camera
 
 log = logging.getLogger("heatsplat")
 
-# Gaussians make no thin sheets: along a ray their opacity is spread over many widths of a pixel, before the surface or behind
-# it, so that the mean depth lies far off. The surface is where opacity lies closest: the middle of the shortest stretch with this
-# share of it. Vertices on "cooling" and "outdoor" err by 1.7 and 0.7 widths (median; 1,500 steps), by the median depth by 2.0 and
-# 1.0, by the mean depth by 3.2 and 9. Where that stretch is longer than the truncation, a pixel shows fog.
-STRETCH = 0.4
-SHARES = 16  # starts of stretches that are compared
-DEPTHS = 96  # of a view at which the opacity before them is taken, linear in between
-TOGETHER = 4  # of them in one image; more channels take longer each
-BESIDE = 0.5, 1.3  # of the nearest and the farthest mean depth, between which half of them lie
 VOXEL = 3.0  # widths of a pixel on the surface: what Gaussians show is not finer
 TRUNCATION = 4.0  # voxels, at least
 # Views of a flat heath from 75 m disagree on its depth by metres. At a reach of 4 voxels a third of its pixels show fog, and a
@@ -38,38 +30,14 @@ COARSER = 1.25  # factor between edges of voxels that are tried
 
 @torch.no_grad()
 def closest(moment: Moment, view: View) -> tuple[Tensor, Tensor]:
-    """Depth [H, W] (camera z) of the surface that a training view shows, where its opacity lies closest, and over how much depth
-    that lies [H, W]; infinite where a pixel is open, or its mask leaves it out."""
+    """Depth [H, W] (camera z) of the surface that a training view shows, and over how much depth its opacity lies [H, W]
+    (``geometry.closest_depth``); infinite where a pixel is open, or its mask leaves it out."""
     moment = moment if moment.whole is None else moment.whole
     seen, camera = moment.seen, view.frame.camera
     shapes = seen.means, seen.quats, seen.scales, seen.opacities[None]
-    z = to_camera(seen.means.double(), camera.viewmat.to(seen.means.device))[:, 2].float()
-    values_seen = moment.module.renderer.values_seen
-    output = values_seen(shapes, moment.blended[:, None], camera, depth=True)  # as a look has it
-    alpha = output.alpha[0]
-    mean = surface_depth(output.depth, alpha)
-    known = mean.isfinite() if view.mask is None else mean.isfinite() & view.mask.to(mean.device)
-    nothing = torch.full(mean.shape, torch.inf)
-    if not known.any():
-        return nothing, nothing
-    there = mean[known]
-    ends = [there.min().mul(BESIDE[0]).item(), there.max().mul(BESIDE[1]).item()]
-    evenly = torch.linspace(0, 1, DEPTHS // 2).to(there)
-    ends = torch.cat([quantile(there, evenly), ends[0] + (ends[1] - ends[0]) * evenly]).sort().values
-    parts = [values_seen(shapes, (z[:, None] < some).float(), camera).features[known] for some in ends.split(TOGETHER)]
-    before = torch.cat(parts, dim=-1) / alpha[known, None]
-    # Shares of the opacity at even steps, so that a stretch is a number of them.
-    step = STRETCH / SHARES
-    shares = torch.arange(step, 1 - 0.5 * step, step).to(before)
-    after = torch.searchsorted(before.cummax(1).values, shares.repeat(len(before), 1)).clamp(1, DEPTHS - 1)
-    start, end = before.gather(1, after - 1), before.gather(1, after)
-    depths = torch.lerp(ends[after - 1], ends[after], ((shares - start) / (end - start).clamp(min=1e-6)).clamp(0, 1))
-    spread, first = (depths[:, SHARES:] - depths[:, :-SHARES]).min(1, keepdim=True)
-    found = []
-    for values in (depths.gather(1, first + SHARES // 2), spread):
-        found.append(nothing.clone())
-        found[-1][known.cpu()] = values[:, 0].cpu()
-    return found[0], found[1]
+    return closest_depth(
+        partial(moment.module.renderer.values_seen, shapes, camera=camera), seen.means, camera, view.mask
+    )
 
 
 def made_surface(

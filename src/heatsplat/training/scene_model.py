@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera, Frame, RenderOutput, SceneData, SceneError, View
+from heatsplat.geometry.closest_depth import closest_depth
 from heatsplat.geometry.coverage import gap_free, seen_means, surface_depth
 from heatsplat.renderers.settings import Renderer
 from heatsplat.renderers.smoothing import Smoothing
@@ -178,6 +179,16 @@ class SceneModel(pl.LightningModule):
         frame's camera as it is given, by whose rays it is read."""
         output = self.render(frame, depth=True, camera=frame.camera)
         return surface_depth(output.depth, output.alpha[0]).cpu()
+
+    @torch.no_grad()
+    def surface(self, frame: Frame) -> Tensor:
+        """As ``depth``, and nearer to the truth where opacity is spread before or behind a surface; some 25 renders each
+        (``geometry.closest_depth``). Of fields it is ``depth``."""
+        if self.thermal.rows == NOTHING:
+            return self.depth(frame)
+        *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
+        seen = partial(self.renderer.values_seen, (*shape, opacities[:1]), camera=frame.camera)
+        return closest_depth(seen, shape[0], frame.camera)[0]
 
     @contextmanager
     def showing(self, splats: Splats) -> Iterator[None]:

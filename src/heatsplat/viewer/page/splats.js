@@ -14,6 +14,27 @@ function inUnits(one, array) {
   return Float32Array.from(wholeSteps(one, array), (steps) => steps * one.step);
 }
 
+// Depth of the surface that Gaussians of rising depths show, by their weights: the middle of the shortest stretch with so much of them.
+// Before a surface and behind it lies opacity, too, so that the mean depth may be far off. Infinity of none.
+const STRETCH = 0.4;
+
+function closestDepth(depths, weights) {
+  const total = weights.reduce((sum, weight) => sum + weight, 0);
+  let found = Infinity, shortest = Infinity, end = 0, inside = 0;
+  for (let start = 0; start < depths.length; start++) {
+    while (end < depths.length && inside < STRETCH * total) inside += weights[end++];
+    if (inside < STRETCH * total) break;
+    if (depths[end - 1] - depths[start] < shortest) {
+      shortest = depths[end - 1] - depths[start];
+      let middle = start;
+      for (let half = weights[start]; half < 0.5 * inside; half += weights[middle]) middle += 1;
+      found = depths[middle];
+    }
+    inside -= weights[start];
+  }
+  return found;
+}
+
 class Splats {
   constructor({ told, array }) {
     this.told = told;
@@ -143,16 +164,16 @@ class Splats {
       if (alpha >= ALPHA_MIN) reached.push([z, i, alpha]);
     }
     reached.sort((p, q) => p[0] - q[0] || p[1] - q[1]);
-    const ids = [], weights = [];
-    let left = 1, depth = 0;
+    const ids = [], weights = [], depths = [];
+    let left = 1;
     for (const [z, i, alpha] of reached) {
       if (left * (1 - alpha) <= TRANSMITTANCE_MIN) break;
       ids.push(i);
       weights.push(alpha * left);
-      depth += alpha * left * z;
+      depths.push(z);
       left *= 1 - alpha;
     }
-    return { ids, weights, left, depth: left < 1 ? depth / (1 - left) : Infinity };
+    return { ids, weights, left, depth: closestDepth(depths, weights) };
   }
 
   // A pixel at some times: the weights stand still, the Gaussians of the pixel change.

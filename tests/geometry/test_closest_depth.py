@@ -1,0 +1,55 @@
+"""The surface that Gaussians show, with fog before it and clutter behind it."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from heatsplat.contracts import Camera
+from heatsplat.geometry.closest_depth import closest_depth
+from heatsplat.geometry.coverage import surface_depth
+from heatsplat.renderers.settings import Renderer
+
+WALL = 4.0
+
+
+@pytest.fixture
+def camera() -> Camera:
+    K = torch.tensor([[40.0, 0, 16], [0, 40.0, 12], [0, 0, 1]], dtype=torch.float64)
+    return Camera(torch.eye(4, dtype=torch.float64), K, 32, 24)
+
+
+def layers(*opacity_at: tuple[float, float]):
+    """What shows layers of Gaussians across the image, each with an opacity and a depth, and their centres."""
+    x, y = torch.meshgrid(torch.linspace(-1, 1, 41), torch.linspace(-1, 1, 41), indexing="xy")
+    plane = torch.stack([x, y, torch.ones_like(x)], dim=-1).reshape(-1, 3)
+    means = torch.cat([z * plane for _, z in opacity_at])
+    scales = torch.cat([torch.full_like(plane, 0.05 * z) for _, z in opacity_at])
+    opacities = torch.cat([torch.full((len(plane),), opacity) for opacity, _ in opacity_at])
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(len(means), 4)
+    shapes = means, quats, scales * torch.tensor([1.0, 1.0, 0.05]), opacities[None]
+    return partial(Renderer(backend="cpu").values_seen, shapes), means
+
+
+def test_fog_before_a_wall_and_clutter_behind_it_do_not_move_it(camera):
+    fog = [(0.02, z) for z in (1.0, 1.5, 2.0, 2.5, 3.0)]
+    clutter = [(0.5, z) for z in (8.0, 12.0, 20.0)]
+    show, means = layers(*fog, (0.3, WALL), *clutter)
+    seen = partial(show, camera=camera)
+    depth, spread = closest_depth(seen, means, camera)
+    output = seen(values=torch.zeros(len(means), 1), depth=True)
+    mean = surface_depth(output.depth, output.alpha[0])
+    inner = (slice(6, -6), slice(6, -6))
+    assert (depth - WALL).abs()[inner].max() < 0.06 * WALL and spread[inner].max() < 0.2 * WALL
+    assert (mean - WALL).abs()[inner].median() > 0.1 * WALL
+
+
+def test_a_mask_and_open_pixels_are_infinite(camera):
+    show, means = layers((0.5, WALL))
+    mask = torch.ones(24, 32, dtype=torch.bool)
+    mask[:, :10] = False
+    depth, spread = closest_depth(partial(show, camera=camera), means, camera, mask)
+    assert depth[:, :10].isinf().all() and spread[:, :10].isinf().all() and depth[:, 10:].isfinite().all()
+    show, means = layers((0.01, WALL))
+    depth, spread = closest_depth(partial(show, camera=camera), means, camera)
+    assert depth.isinf().all() and spread.isinf().all()
