@@ -29,7 +29,7 @@ from heatsplat.studies.score import ENDINGS, TRUTH
 
 TEMPLATE = Path(__file__).with_name("page.html")
 SHOWN = ("views", "times")  # parts of which the view in the middle is shown
-QUALITY = 11  # of its WebP: hundreds of pictures are in one page
+QUALITY = 9  # of its WebP: hundreds of pictures are in one page
 WIDTH = 200  # pixels, in which the template shows a picture
 
 
