@@ -812,14 +812,11 @@ def test_a_box_on_the_picture_becomes_one_in_the_scene_around_what_it_shows(page
 @pytest.mark.parametrize(
     ("depths", "weights", "found"),
     [
-        (
-            [1, 2, 4, 4.1, 4.2, 9],
-            [0.05, 0.05, 0.15, 0.3, 0.15, 0.3],
-            4.1,
-        ),  # neither fog nor what lies behind moves the surface
+        # Neither fog nor what lies behind moves the surface; faint Gaussians count by their share; of none it is infinite.
+        ([1, 2, 4, 4.1, 4.2, 9], [0.05, 0.05, 0.15, 0.3, 0.15, 0.3], 4.1),
         ([1, 3, 8], [0.1, 0.5, 0.4], 3),
-        ([2, 3], [0.02, 0.02], 2),  # faint ones count by their share
-        ([], [], None),  # Infinity
+        ([2, 3], [0.02, 0.02], 2),
+        ([], [], None),
     ],
 )
 def test_a_surface_lies_where_weights_lie_closest(page, depths, weights, found):
