@@ -27,7 +27,7 @@ def closest_depth(
     seen: Callable[..., RenderOutput], means: Tensor, camera: Camera, mask: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Depth [H, W] (camera z) of the surface that Gaussians show a camera, where their opacity lies closest, and over how much
-    depth that lies [H, W]; infinite where a pixel is open, or the mask leaves it out. On the CPU.
+    depth that lies [H, W]; infinite where a pixel is open, or the mask leaves it out. In world units, on the CPU (ours).
 
     Args:
         seen: what the camera sees of values [N, C] of the Gaussians, and their depth with ``depth=True``

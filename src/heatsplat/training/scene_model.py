@@ -182,8 +182,11 @@ class SceneModel(pl.LightningModule):
 
     @torch.no_grad()
     def surface(self, frame: Frame) -> Tensor:
-        """As ``depth``, and nearer to the truth where opacity is spread before or behind a surface; some 25 renders each
-        (``geometry.closest_depth``). Of fields it is ``depth``."""
+        """Camera z [H, W] of the surface in a frame, in world units, on the CPU; infinite where there is none.
+
+        Where opacity is spread before or behind a surface it is nearer to the truth than ``depth``, and costs some 25 renders
+        (``geometry.closest_depth``). Of fields it is ``depth``.
+        """
         if self.thermal.rows == NOTHING:
             return self.depth(frame)
         *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
