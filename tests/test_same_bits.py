@@ -4,7 +4,7 @@ import pytest
 import torch
 from threads import with_threads
 
-from heatsplat.same_bits import PIECE, ROW, everywhere, mean, sigmoid, total
+from heatsplat.same_bits import PIECE, ROW, everywhere, mean, sigmoid, total, weighted
 from heatsplat.splats import Splats
 
 NUMBERS = 3 * PIECE + 12_345  # more than torch leaves to one thread; shares of threads end inside vectors
@@ -69,3 +69,30 @@ def test_opacities_have_the_same_bits_for_any_number_of_threads():
     splats = Splats(shapes | {"opacity_logits": 8 * random(70_001, 1) - 4})
     one, *others = with_threads((1, 2, 3, 5, 7), lambda: splats.opacities.detach().clone())
     assert one.shape == (1, 70_001) and all(torch.equal(one, other) for other in others)
+
+
+def test_weighted_columns_and_their_gradients_are_right_and_the_same_for_any_number_of_threads():
+    columns, pull = random(NUMBERS, 9).requires_grad_(), random(NUMBERS, seed=1) - 0.5
+    weights = (random(9, seed=2) - 0.5).requires_grad_()
+
+    def results():
+        found = weighted(columns, weights)
+        return [found.detach(), *torch.autograd.grad((found * pull).sum(), (columns, weights))]
+
+    one, *others = with_threads((1, 2, 3, 7), results)
+    exact = columns.detach().double(), weights.detach().double(), pull.double()
+    torch.testing.assert_close(one[0].double(), exact[0] @ exact[1], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(one[2].double(), exact[0].T @ exact[2], rtol=1e-4, atol=1e-2)
+    for other in others:
+        assert all(torch.equal(*pair) for pair in zip(one, other, strict=True))
+
+
+@pytest.mark.parametrize("width", [1, 2, 16, 64])
+def test_weights_of_a_layer_learn_the_same_bits_for_any_number_of_threads(width):
+    values, layer = random(NUMBERS, 16) - 0.5, torch.nn.Linear(16, width)
+    pull = random(NUMBERS, width, seed=1) - 0.5
+    one, *others = with_threads(
+        (1, 2, 3, 7), lambda: torch.autograd.grad((layer(values) * pull).sum(), layer.weight)[0]
+    )
+    assert one.any()
+    assert all(torch.equal(one, other) for other in others)

@@ -2,7 +2,8 @@
 
 torch splits a tensor of 32,768 numbers or more among its threads. A sum to one number then adds in another order, and a sigmoid
 leaves what ends between two vectors at other places, where it is computed in another way. The last bits of a run, and in the
-end its Gaussians, would differ from one machine to another. Sums along a row do not.
+end its Gaussians, would differ from one machine to another. Sums along a row do not, nor do products of two matrices
+(``heatsplat/__init__.py`` asks MKL for that); those of a matrix and a vector do.
 """
 
 from __future__ import annotations
@@ -38,6 +39,11 @@ def everywhere(value: Tensor, like: Tensor) -> Tensor:
 def sigmoid(values: Tensor) -> Tensor:
     """The sigmoid of values of any shape; on a CPU one piece after the other."""
     return values.sigmoid() if values.numel() <= PIECE or values.device.type != "cpu" else _Sigmoid.apply(values)
+
+
+def weighted(columns: Tensor, weights: Tensor) -> Tensor:
+    """The columns of a tensor [n, K] weighted with K numbers and added, [n]; the gradients of both have the same bits, too."""
+    return (columns @ weights[:, None])[:, 0]
 
 
 def to_one(values: Tensor, weight: Tensor, bias: Tensor) -> Tensor:

@@ -106,3 +106,18 @@ def test_lightning_is_loaded_without_what_no_command_uses_and_who_asks_for_it_la
 
     assert len(scipy.signal.windows.hann(5)) == 5
     assert torch.compile(lambda x: x + 1, backend="eager")(torch.ones(2)).tolist() == [2.0, 2.0]
+
+
+@pytest.mark.parametrize("user", [None, "COMPATIBLE"])
+def test_sums_of_matrix_products_do_not_depend_on_threads_where_the_processor_would_let_them(user):
+    """What the user sets stands, and other processors than Intel's are left as they are."""
+    environment = {name: value for name, value in os.environ.items() if name != "MKL_CBWR"}
+    environment |= {"PYTHONPATH": str(SRC)} | ({} if user is None else {"MKL_CBWR": user})
+    told = subprocess.run(
+        [sys.executable, "-c", "import heatsplat, os; print(heatsplat._made_by_intel(), os.environ.get('MKL_CBWR'))"],
+        env=environment, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    intel, mode = told.stdout.split()
+    cpuinfo = Path("/proc/cpuinfo")
+    assert not cpuinfo.exists() or intel == str("GenuineIntel" in cpuinfo.read_text())
+    assert mode == (user or {"True": "AUTO,STRICT", "False": "None"}[intel])

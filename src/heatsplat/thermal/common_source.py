@@ -13,7 +13,7 @@ from heatsplat.physics.common_course import MOMENTS, RATES, response_table
 from heatsplat.physics.curves import resampled_values
 from heatsplat.physics.first_look import first_numbers
 from heatsplat.physics.responses import MOMENTS_KEPT
-from heatsplat.same_bits import everywhere
+from heatsplat.same_bits import everywhere, weighted
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Rate, Seeds
 from heatsplat.thermal.relaxing import Relaxing
@@ -109,7 +109,7 @@ class CommonSource(Relaxing):
 
     def _state(self, splats: Splats, time_s: float | None, ids: Tensor | None) -> Tensor:
         # Of all Gaussians, and then those in view: to pick rows and to spread their gradients takes twice as long.
-        above = Query(ids).rows(splats["modes"] @ self._modes_at(time_s))
+        above = Query(ids).rows(weighted(splats["modes"], self._modes_at(time_s)))
         return everywhere(self.ambient, above) + above
 
     def _modes_at(self, time_s: float | None) -> Tensor:

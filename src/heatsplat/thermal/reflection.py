@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from heatsplat.contracts import SceneData
 from heatsplat.geometry import spherical_harmonics
 from heatsplat.geometry.rotations import reflected
-from heatsplat.same_bits import everywhere, sigmoid
+from heatsplat.same_bits import everywhere, sigmoid, weighted
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, surface_normals
 from heatsplat.thermal.part import HeatPart
@@ -72,7 +72,7 @@ class Reflection(HeatPart):
         if self.degree == 0:
             return everywhere(spherical_harmonics.C0 * self.surroundings, values)
         mirrored = reflected(query.sight(splats, "what a surface mirrors"), query.normals(splats))
-        return (spherical_harmonics.basis(mirrored, self.degree) @ self.surroundings)[:, None]
+        return weighted(spherical_harmonics.basis(mirrored, self.degree), self.surroundings)[:, None]
 
     def attributes(self, splats: Splats, query: Query) -> dict[str, Tensor]:
         return {"reflectance": sigmoid(query.rows(splats["reflectance_logit"]))}
