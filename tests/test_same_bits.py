@@ -4,7 +4,7 @@ import pytest
 import torch
 from threads import with_threads
 
-from heatsplat.same_bits import PIECE, ROW, everywhere, mean, sigmoid, total, weighted
+from heatsplat.same_bits import PIECE, ROW, everywhere, mean, sigmoid, softplus, total, weighted
 from heatsplat.splats import Splats
 
 NUMBERS = 3 * PIECE + 12_345  # more than torch leaves to one thread; shares of threads end inside vectors
@@ -69,6 +69,24 @@ def test_opacities_have_the_same_bits_for_any_number_of_threads():
     splats = Splats(shapes | {"opacity_logits": 8 * random(70_001, 1) - 4})
     one, *others = with_threads((1, 2, 3, 5, 7), lambda: splats.opacities.detach().clone())
     assert one.shape == (1, 70_001) and all(torch.equal(one, other) for other in others)
+
+
+@pytest.mark.parametrize("shape", [(PIECE,), (NUMBERS, 1), (20_001, 3)])
+def test_a_softplus_is_exact_and_the_same_for_any_number_of_threads(shape):
+    values, pull = (60.0 * random(*shape) - 30.0), random(*shape, seed=1)
+    values.view(-1)[:3] = torch.tensor([0.0, 200.0, -200.0])
+    values.requires_grad_()
+
+    def results():
+        found = softplus(values)
+        return found.detach(), torch.autograd.grad(found, values, pull)[0]
+
+    one, *others = with_threads((1, 2, 3, 7), results)
+    exact = values.detach().double()
+    torch.testing.assert_close(one[0].double(), torch.logaddexp(exact, torch.zeros_like(exact)), rtol=3e-7, atol=1e-40)
+    torch.testing.assert_close(one[1].double(), exact.sigmoid() * pull, rtol=1e-6, atol=1e-40)
+    for other in others:
+        assert all(torch.equal(*pair) for pair in zip(one, other, strict=True))
 
 
 def test_weighted_columns_and_their_gradients_are_right_and_the_same_for_any_number_of_threads():

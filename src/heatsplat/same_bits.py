@@ -1,8 +1,8 @@
 """What torch computes with other bits on another number of threads, here with the same on any.
 
 torch splits a tensor of 32,768 numbers or more among its threads. A sum to one number then adds in another order, and a sigmoid
-leaves what ends between two vectors at other places, where it is computed in another way. The last bits of a run, and in the
-end its Gaussians, would differ from one machine to another. Sums along a row do not, nor do products of two matrices
+or a softplus leaves what ends between two vectors at other places, where it is computed in another way. The last bits of a run,
+and in the end its Gaussians, would differ from one machine to another. Sums along a row do not, nor do products of two matrices
 (``heatsplat/__init__.py`` asks MKL for that); those of a matrix and a vector do.
 """
 
@@ -39,6 +39,12 @@ def everywhere(value: Tensor, like: Tensor) -> Tensor:
 def sigmoid(values: Tensor) -> Tensor:
     """The sigmoid of values of any shape; on a CPU one piece after the other."""
     return values.sigmoid() if values.numel() <= PIECE or values.device.type != "cpu" else _Sigmoid.apply(values)
+
+
+def softplus(values: Tensor) -> Tensor:
+    """log(1 + e^x) of values of any shape; of many on a CPU by functions that do not depend on the threads."""
+    few = values.numel() <= PIECE or values.device.type != "cpu"
+    return torch.nn.functional.softplus(values) if few else _Softplus.apply(values)
 
 
 def weighted(columns: Tensor, weights: Tensor) -> Tensor:
@@ -81,3 +87,15 @@ class _Sigmoid(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> Tensor:
         (found,) = ctx.saved_tensors
         return torch.ops.aten.sigmoid_backward(grad, found)
+
+
+class _Softplus(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        ctx.save_for_backward(values)
+        return values.clamp(min=0.0) + torch.log1p(torch.exp(-values.abs()))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        return grad * sigmoid(ctx.saved_tensors[0])

@@ -13,6 +13,8 @@ from heatsplat.export.basis import constant_basis
 from heatsplat.export.formats.map import Map
 from heatsplat.export.moment import moments
 from heatsplat.export.place import place_of
+from heatsplat.io.pictures import MARKED
+from heatsplat.io.tables import read_csv
 from heatsplat.training.cameras import RefinedCameras
 
 rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (pip install -e '.[dev]')")
@@ -103,6 +105,39 @@ def test_a_quotient_is_that_of_what_a_pixel_mixes(two_plates, tmp_path, monkeypa
     assert 0.3 < front < 0.7 and abs(u - (front * 10.0 + (1 - front) * 15.0)) > 0.2
 
 
+def test_the_last_band_is_the_height_of_the_surface(two_plates, tmp_path, monkeypatch):
+    """Also of a map that is looked at in strips, and of places that float32 tells to a millimetre only by the camera."""
+    form = Map(resolution=0.02, bounds=[-3, -3, 3, 3], above=[0, 0, 1], unseen="keep", height=True)
+    form.write(two_plates, tmp_path / "a.tif")
+    monkeypatch.setattr("heatsplat.export.formats.map.AT_ONCE", 7 * 300)
+    form.write(two_plates, tmp_path / "strips.tif")
+    places = place_of(two_plates.module.scene, above=torch.tensor([0.0, 0.0, 1.0]))(two_plates.seen.means).tolist()
+    with rasterio.open(tmp_path / "a.tif") as found, rasterio.open(tmp_path / "strips.tif") as strips:
+        assert found.descriptions[-1] == "height [metre]"
+        heights, values = found.read(found.count), found.read(1)
+        assert np.array_equal(np.isfinite(heights), np.isfinite(values))
+        for x, y, z in places:
+            for file in (found, strips):
+                assert next(file.sample([(x, y)]))[-1] == pytest.approx(z, abs=0.01)
+
+
+def test_areas_of_an_isotherm_lie_beside_the_map_and_in_its_picture(two_plates, tmp_path):
+    settings = {"resolution": 0.02, "bounds": [-3, -3, 3, 3], "above": [0, 0, 1], "unseen": "keep"}
+    bounds = two_plates.module.scene.thermal_range
+    Map(**settings).write(two_plates, tmp_path / "plain.tif")
+    Map(**settings, height=True, isotherm=[bounds.to_celsius(0.5), None]).write(two_plates, tmp_path / "a.tif")
+    (row,) = read_csv(tmp_path / "a_areas.csv")
+    with rasterio.open(tmp_path / "a.tif") as found:
+        warm = found.read(1) >= bounds.to_celsius(0.5)
+    assert row["area_m2"] == pytest.approx(warm.sum() * 0.02**2, rel=1e-5)
+    place = place_of(two_plates.module.scene, above=torch.tensor([0.0, 0.0, 1.0]))(two_plates.seen.means)[1].tolist()
+    assert np.hypot(row["spot_x"] - place[0], row["spot_y"] - place[1]) < 0.9
+    assert row["spot_height"] == pytest.approx(place[2], abs=0.01)
+    with Image.open(tmp_path / "a.png") as picture, Image.open(tmp_path / "plain.png") as plain:
+        green = [(np.asarray(one.convert("RGB")) == MARKED).all(2).sum() for one in (picture, plain)]
+    assert green[0] > 100 and green[1] == 0
+
+
 def test_bounds_beside_the_scene_are_refused(two_plates, tmp_path):
     for bounds in ([51.40, 4.43, 51.41, 4.44], [500, 500, 510, 510]):
         with pytest.raises(SceneError, match="what.bounds=.* holds no pixel of the scene, which runs from"):
@@ -160,6 +195,9 @@ def test_a_map_that_lies_elsewhere_is_told_or_refused(cooling, tmp_path, caplog)
         ({"bounds": [3, 0, 1, 2]}, "what.bounds must be"),
         ({"unseen": "show"}, "what.unseen must be one of nan, keep, got 'show'"),
         ({"above": [0, 0, 0]}, "what.above must be a direction"),
+        ({"isotherm": [30]}, "what.isotherm must be"),
+        ({"isotherm": [30, None], "least_area": 0}, "what.least_area must be above 0"),
+        ({"least_area": 2.0}, "what.least_area is of the areas of an isotherm: give what.isotherm"),
     ],
 )
 def test_settings_that_make_no_map_are_named(settings, message):

@@ -44,6 +44,16 @@ def test_fog_before_a_wall_and_clutter_behind_it_do_not_move_it(camera):
     assert (mean - WALL).abs()[inner].median() > 0.1 * WALL
 
 
+def test_a_surface_before_all_mean_depths_is_found_where_its_gaussians_lie(camera):
+    """As the ground below a drone, with much of a pixel's opacity far behind it: any stretch within half a unit of 74."""
+    thin = [(0.03, 73.5 + 0.05 * i) for i in range(21)]
+    far = (0.1, 110.0), (0.1, 130.0), (0.1, 160.0), (0.2, 300.0), (0.5, 900.0)
+    show, means = layers(*thin, *far)
+    depth, spread = closest_depth(partial(show, camera=camera), means, camera)
+    inner = (slice(6, -6), slice(6, -6))
+    assert (depth - 74.0).abs()[inner].median() < 0.55 and spread[inner].median() < 0.3
+
+
 def test_a_mask_and_open_pixels_are_infinite(camera):
     show, means = layers((0.5, WALL))
     mask = torch.ones(24, 32, dtype=torch.bool)

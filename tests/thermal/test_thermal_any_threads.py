@@ -43,6 +43,7 @@ MODELS = {
     "radiative transfer": lambda: RadiativeTransfer(Static(floor=False), Attenuation(moments=0)),
     "conduction": lambda: Conducting(Static(floor=False), flow=2.0),
     "imaging field": lambda: ImagingField(Static(), exponent="printed"),
+    "imaging field of positive coefficients": lambda: ImagingField(Static(), exponent="positive"),
     "balance": lambda: EnergyBalance(materials=8),
     "linear balance": lambda: EnergyBalance(solution="linear", materials=8),
 }

@@ -7,6 +7,8 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional
 
+from heatsplat.same_bits import mean, total
+
 
 def cleared(image: Tensor, mask: Tensor | None) -> Tensor:
     """The image [H, W, C] with 0 where the mask is False, whatever stands there, NaN too; no gradient goes through these."""
@@ -24,8 +26,8 @@ def filled(image: Tensor, mask: Tensor | None) -> Tensor:
 def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
     """The mean of [H, W, C] over the pixels that count and their channels; 0 where none counts."""
     if mask is None:
-        return values.mean()
-    return cleared(values, mask).sum() / (mask.sum() * values.shape[2]).clamp(min=1)
+        return mean(values)
+    return total(cleared(values, mask)) / (mask.sum() * values.shape[2]).clamp(min=1)
 
 
 def eroded(mask: Tensor) -> Tensor:

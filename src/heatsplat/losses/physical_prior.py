@@ -7,7 +7,7 @@ from torch import Tensor
 from heatsplat.contracts import check_option
 from heatsplat.geometry.spherical_harmonics import C0
 from heatsplat.losses.compose import LossInputs, LossTerm
-from heatsplat.same_bits import sigmoid
+from heatsplat.same_bits import mean, sigmoid, total
 
 OF = ("activated", "coefficients")
 REDUCTIONS = ("sum", "mean")
@@ -66,4 +66,4 @@ class PhysicalPrior(LossTerm):
         else:
             excess = outside(emissivity).square() + outside(reflectance).square()
         terms = excess + kirchhoff_excess(emissivity, reflectance, self.tolerance).square()
-        return terms.sum() if self.summed else terms.mean()
+        return total(terms) if self.summed else mean(terms)

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from heatsplat.losses.compose import LossInputs, LossTerm
 from heatsplat.losses.masking import cleared
+from heatsplat.same_bits import mean, total
 
 
 class Squared(LossTerm):
@@ -21,6 +22,6 @@ class Squared(LossTerm):
     def __call__(self, inputs: LossInputs) -> dict[str, Tensor]:
         (prediction, target), mask = inputs.pair(self.modality), inputs.mask
         if mask is None:
-            return {"squared": (prediction - target).square().mean()}
+            return {"squared": mean((prediction - target).square())}
         errors = (cleared(prediction, mask) - cleared(target, mask)).square()
-        return {"squared": errors.mean(-1).sum() / mask.sum().clamp(min=1)}
+        return {"squared": total(errors.mean(-1)) / mask.sum().clamp(min=1)}

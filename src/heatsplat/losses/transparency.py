@@ -6,13 +6,14 @@ from torch import Tensor
 
 from heatsplat.contracts import SceneData
 from heatsplat.losses.compose import LossInputs, LossTerm
+from heatsplat.same_bits import mean
 
 
 class MeanOpacity(LossTerm):
     """Mean opacity of all Gaussians, over modalities too (Kheradmand et al. 2024, Eq. 12)."""
 
     def __call__(self, inputs: LossInputs) -> Tensor:
-        return inputs.splats.opacities.mean()
+        return mean(inputs.splats.opacities)
 
 
 class MeanSize(LossTerm):
@@ -27,4 +28,4 @@ class MeanSize(LossTerm):
         return {}
 
     def __call__(self, inputs: LossInputs) -> Tensor:
-        return inputs.splats.scales.mean() / self._extent
+        return mean(inputs.splats.scales) / self._extent

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import softplus
 
 from heatsplat.contracts import SceneData, check_option
+from heatsplat.same_bits import softplus
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import PerGaussian, Query, Seeds, ThermalModel
 from heatsplat.thermal.coordinates import Box, Clock, check_frames_per_cycle, octaves, slow_octaves

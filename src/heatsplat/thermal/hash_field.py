@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from heatsplat.geometry import hash_grid, spherical_harmonics
 from heatsplat.geometry.volume import contracted
+from heatsplat.same_bits import sigmoid
 from heatsplat.thermal.base import PerGaussian, Query, Seeds
 from heatsplat.thermal.field import Field
 from heatsplat.thermal.layers import draw_uniform
@@ -93,7 +94,7 @@ class HashField(Field):
         seen = known
         if self.directional:
             seen = torch.cat((known, spherical_harmonics.basis(directions, DEGREE).to(known)), dim=1)
-        answers = [head(seen if name in self.directional else known).sigmoid() for name, head in self.heads.items()]
+        answers = [sigmoid(head(seen if name in self.directional else known)) for name, head in self.heads.items()]
         return torch.cat(answers, dim=1) if len(answers) > 1 else answers[0]
 
     @property

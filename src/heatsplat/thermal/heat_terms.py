@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from heatsplat.same_bits import mean, total
 from heatsplat.thermal.land_cover import ATTRIBUTES
 
 SCALES = {"emissivity": 1.0, "absorptivity": 1.0, "convection": 10.0, "capacity": 2.5e6}  # what counts as one
@@ -16,7 +17,7 @@ SCALES = {"emissivity": 1.0, "absorptivity": 1.0, "convection": 10.0, "capacity"
 
 def change(now: Tensor, later: Tensor) -> Tensor:
     """L_smooth, the mean |T(t + Δ) - T(t)| (Eq. 10 with one interval)."""
-    return (later - now).abs().mean()
+    return mean((later - now).abs())
 
 
 def difference_quotient(now: Tensor, later: Tensor, rates: Tensor, interval_s: float, scale_s: float) -> Tensor:
@@ -27,12 +28,12 @@ def difference_quotient(now: Tensor, later: Tensor, rates: Tensor, interval_s: f
         interval_s: Δ, of either sign.
         scale_s: seconds in which a change by the whole range counts as one.
     """
-    return ((later - now) / interval_s - rates).abs().mean() * scale_s
+    return mean(((later - now) / interval_s - rates).abs()) * scale_s
 
 
 def integration(now: Tensor, later: Tensor, rates: Tensor, interval_s: float) -> Tensor:
     """L_ode, the mean |T(t) + Δ dT/dt - T(t + Δ)| with the rate at the middle of the interval."""
-    return (now + interval_s * rates - later).abs().mean()
+    return mean((now + interval_s * rates - later).abs())
 
 
 def to_reference(body: dict[str, Tensor], reference: Tensor) -> Tensor:
@@ -43,8 +44,8 @@ def to_reference(body: dict[str, Tensor], reference: Tensor) -> Tensor:
         reference: [n, 4] in the order of ``land_cover.ATTRIBUTES``; NaN where there is none, which does not count.
     """
     known = ~reference[:, 0].isnan()
-    total = sum(
-        ((body[name] - reference[:, column]).abs() / SCALES[name]).masked_fill(~known, 0.0).sum()
+    apart = sum(
+        total(((body[name] - reference[:, column]).abs() / SCALES[name]).masked_fill(~known, 0.0))
         for column, name in enumerate(ATTRIBUTES)
     )
-    return total / (len(ATTRIBUTES) * known.sum().clamp(min=1))
+    return apart / (len(ATTRIBUTES) * known.sum().clamp(min=1))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import layer_norm, softplus
+from torch.nn.functional import layer_norm
 
 from heatsplat.contracts import SceneData, check_option
 from heatsplat.physics.units import DAY_S, STEFAN_BOLTZMANN
-from heatsplat.same_bits import sigmoid
+from heatsplat.same_bits import mean, sigmoid, softplus
 from heatsplat.splats import Splats
 from heatsplat.thermal.base import KELVIN_RANGE, PerGaussian, Query, Rate, Seeds, ThermalModel
 from heatsplat.thermal.clipping import clipped
@@ -221,10 +221,10 @@ class NtrGaussian(ThermalModel):
         integral = step * (rates.sum(1) - 0.5 * (rates[:, 0] + rates[:, -1]))
         if torch.is_grad_enabled() and self.training and len(units):  # a mean over no Gaussian in view is NaN
             self._terms = {
-                "consistency": (units[:, 0] - integral - units[:, -1]).square().mean(),
+                "consistency": mean((units[:, 0] - integral - units[:, -1]).square()),
                 "environment": (env - self.ambient).square().mean(),
-                "variation": sum(values.diff(dim=-1).abs().mean() for values in (env, wind, units)),
-                "integral": integral.square().mean(),
+                "variation": sum(mean(values.diff(dim=-1).abs()) for values in (env, wind, units)),
+                "integral": mean(integral.square()),
             }
         return units[:, 0] - integral
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from heatsplat.contracts import Camera, SceneData
+from heatsplat.same_bits import mean, sigmoid
 from heatsplat.splats import ANCHORS, Splats
 from heatsplat.thermal.base import Geometry, PerGaussian, Query, Rate, Seeds, ThermalModel
 from heatsplat.thermal.layers import draw_uniform
@@ -120,10 +121,10 @@ class Scaffold(ThermalModel):
         inputs = self._inputs(splats, query.camera, rows)
         opacities = torch.tanh(self.networks["opacity"](inputs)).clamp(min=0.0)
         shape = self.networks["shape"](inputs).unflatten(1, (self.per_row, 7))
-        scales = splats["log_scales"][rows].exp()[:, None] * shape[..., :3].sigmoid()
+        scales = splats["log_scales"][rows].exp()[:, None] * sigmoid(shape[..., :3])
         means = splats.means[:, None] + splats["offsets"] * splats["log_reach"].exp()[:, None]
         if self.volume > 0 and torch.is_grad_enabled():
-            self._volumes = (scales / self.extent).prod(2).mean() if len(rows) else scales.sum()
+            self._volumes = mean((scales / self.extent).prod(2)) if len(rows) else scales.sum()
 
         def spread(values: Tensor) -> Tensor:
             """Rows of all Gaussians [k N, ...] from those of the anchors in view [a, k, ...]; zeros elsewhere."""
@@ -142,7 +143,7 @@ class Scaffold(ThermalModel):
     def features(self, splats: Splats, query: Query) -> Tensor:
         made = query.geometry if isinstance(query.geometry, Decoded) else self.geometry(splats, query)
         rows = made.in_view.nonzero().squeeze(1)
-        values = self.networks["value"](made.inputs).sigmoid().view(-1, self.modality_channels[0])
+        values = sigmoid(self.networks["value"](made.inputs)).view(-1, self.modality_channels[0])
         first = torch.full((len(splats),), -1, device=values.device)
         first[rows] = torch.arange(len(rows), device=values.device)
         ids = torch.arange(len(splats) * self.per_row, device=values.device) if query.ids is None else query.ids

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from heatsplat.contracts import RenderOutput
 from heatsplat.density.ops import Cloud
+from heatsplat.same_bits import mean
 from heatsplat.splats import ANCHORS, GAUSSIANS, NOTHING
 from heatsplat.training.rng import generator_for
 
@@ -102,7 +103,7 @@ class ShortLists(Overlap):
 
     def entropy(self, output: RenderOutput) -> Tensor:
         alone = output.signed.square() + (1.0 - output.alpha[0]).square()
-        return self.weight * (1.0 - alone.mean())
+        return self.weight * (1.0 - mean(alone))
 
     def _last_reset(self, step: int) -> float:
         """The steps of the plan after which sizes were reset last, up to ``step``; 0 before the first."""

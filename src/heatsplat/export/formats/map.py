@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,27 @@ from torch import Tensor
 
 from heatsplat.contracts import Camera, Frame, SceneData, SceneError, check_numbers, quantile
 from heatsplat.export.formats.base import Format, extra_columns, optional
+from heatsplat.export.map_areas import Area, areas_of, write_areas
 from heatsplat.export.moment import Moment
 from heatsplat.export.place import AUTO, Place, place_in_file
 from heatsplat.export.seams import comparison, mosaic, shift_between, smoothed
+from heatsplat.geometry.closest_depth import closest_depth
 from heatsplat.geometry.coverage import OPEN, covered, gap_free, seen_means, surface_depth
 from heatsplat.geometry.looks import surface_points
 from heatsplat.geometry.projection import view_matrix
-from heatsplat.io.pictures import IMAGE_VALUES, Bar, Panel, bounds_of, colorize, compose, enlarged, lettering, write_png
+from heatsplat.io.pictures import (
+    IMAGE_VALUES,
+    MARKED,
+    Bar,
+    Panel,
+    bounds_of,
+    checked_isotherm,
+    colorize,
+    compose,
+    enlarged,
+    lettering,
+    write_png,
+)
 from heatsplat.io.quantities import moment as said
 from heatsplat.shots import at_time, checked_unseen, deviations_told, first_free_id, sightings
 from heatsplat.uncertainty import Uncertainty
@@ -31,6 +46,10 @@ log = logging.getLogger("heatsplat")
 AWAY = 1000.0  # half widths of the map from which it is seen: what stands h high is displaced by h / 1000 at its edge
 LARGEST = 8192  # pixels of a side
 DEVIATION = "standard deviation"  # band of it
+HEIGHT = "height"  # band of it
+AT_ONCE = 1 << 18  # pixels whose height is found together, in 100 MB
+WIDE = 10  # pixels that a flat scene may be high
+NUMBERED = 30  # areas in a picture
 SHOWN = 1600  # pixels of the longer side of a picture at most
 MARGIN_PX = 12  # of its scale
 MARGIN = 0.02  # of the longer side, around the scene's points
@@ -51,6 +70,11 @@ class Map(Format):
         unseen: "nan", or "keep" for what the model makes of places that no training view saw.
         uncertainty: the second band is the standard deviation of each pixel's temperature (``heatsplat.uncertainty``), and
             the last ones are those of the attributes.
+        height: the last band is the height of the surface in the map's unit, where opacity lies closest along the line from
+            above (``geometry.closest_depth``): a digital surface model. It is that of the scene, which GPS may place.
+        isotherm: [low, high], or with None for one of them: connected areas that it holds become a table and outlines
+            (``export.map_areas``), which the picture has, too. None finds none.
+        least_area: of such an area, in squares of the map's unit; None takes four pixels.
         against: such a map, of another run on the same scene or of another survey of the same place: the picture beside the file
             (.png) then compares this map with it and with a mosaic of the recorded images, seams and all (``export.seams``). None
             draws this map alone.
@@ -68,6 +92,9 @@ class Map(Format):
         above: Sequence[float] | None = None,
         unseen: str = "nan",
         uncertainty: bool = False,
+        height: bool = False,
+        isotherm: Sequence[float | None] | None = None,
+        least_area: float | None = None,
         against: str | None = None,
     ) -> None:
         if resolution is not None:
@@ -79,7 +106,15 @@ class Map(Format):
             raise SceneError(f"what.bounds must be [west, south, east, north], got {list(bounds)}")
         if above is not None and (not any(above) or gps not in (None, AUTO)):
             raise SceneError(f"what.above must be a direction [x, y, z], and not beside what.gps; got {list(above)}")
-        self.resolution, self.bounds, self.gps, self.uncertainty = resolution, bounds, gps, uncertainty
+        self.isotherm = checked_isotherm("what.isotherm", isotherm)
+        if least_area is not None:
+            check_numbers("what.least_area", least_area, error=SceneError, above=0)
+            if isotherm is None:
+                raise SceneError(
+                    "what.least_area is of the areas of an isotherm: give what.isotherm, such as [30,null]"
+                )
+        self.resolution, self.bounds, self.gps = resolution, bounds, gps
+        self.uncertainty, self.height, self.least_area = uncertainty, height, least_area
         self.unseen = checked_unseen("what.unseen", unseen)
         self.against = None if against is None else Path(against).expanduser()
         self.above = None if above is None else torch.tensor(above, dtype=torch.float64)
@@ -100,6 +135,9 @@ class Map(Format):
                 f"what.against={self.against} is a map of {other.title}, this one of {title}: give maps of two runs on "
                 "temperatures, or of two on greys"
             )
+        if self.height:
+            bands[f"{HEIGHT} [{place.unit}]"] = self._heights(moment, place, camera, pixel, bands[title])
+        areas = [] if self.isotherm is None else areas_of(own, self.isotherm, grid, self.least_area)
         log.info("map of %d x %d pixels of %.3g %s", width, height, pixel, place.unit)
         with rasterio.open(
             path,
@@ -128,8 +166,12 @@ class Map(Format):
                 method=_method(moment),
                 scene=scene.name,
             )
+        if self.isotherm is not None:
+            heights = bands.get(f"{HEIGHT} [{place.unit}]")
+            files = write_areas(path, areas, grid, place, moment.seen.unit, heights)
+            log.info("%s: %d %s", files[-1], len(areas), "area" if len(areas) == 1 else "areas")
         if other is None:
-            picture = _picture(own, moment, place, pixel)
+            picture = _picture(own, moment, place, pixel, areas, ~grid)
         else:
             _say_shift(other, own, pixel, place.unit, moment.seen.unit, self.against)
             recorded, owner = mosaic(scene, surface_points(camera, smoothed(depth)))
@@ -179,6 +221,30 @@ class Map(Format):
                 "what.resolution, or smaller what.bounds"
             )
         return west, north, pixel, width, height
+
+    @staticmethod
+    def _heights(moment: Moment, place: Place, camera: Camera, pixel: float, known: np.ndarray) -> np.ndarray:
+        """Height of the surface [H, W] in the map's unit; NaN where the first band, ``known``, is, and where opacity is spread
+        over more height than the scene's points have."""
+        seen = moment.seen
+        shapes = seen.means, seen.quats, seen.scales, seen.opacities[None]
+        levels = place(moment.module.scene.points)[:, 2]
+        low, high = (quantile(levels, share).item() for share in (0.005, 0.995))
+        beyond = high - low + WIDE * pixel  # as far as things stand out of it, or it is flat
+        top = float(place(camera.center[None])[0, 2])
+        found, rows = [], max(1, AT_ONCE // camera.width)
+        for first in range(0, camera.height, rows):
+            K = camera.K.clone()
+            K[1, 2] -= first
+            strip = replace(camera, K=K, height=min(rows, camera.height - first))
+            there = torch.from_numpy(np.isfinite(known[first : first + rows]))
+            view = partial(moment.module.renderer.values_seen, shapes, camera=strip)
+            depth, spread = closest_depth(view, seen.means, strip, there)
+            found.append(
+                (top - place.scale * depth.double()).where(spread * place.scale < beyond, torch.nan)
+            )  # else it is fog
+        heights = torch.cat(found)
+        return heights.where((heights > low - beyond) & (heights < high + beyond), torch.nan).numpy()
 
     def _bands(self, moment: Moment, camera: Camera) -> tuple[Tensor, dict[str, np.ndarray]]:
         """Depth of the surface [H, W] in the map's camera, and the bands by name."""
@@ -271,8 +337,13 @@ def _compared(
     return comparison(maps, owner, moment.seen.unit or IMAGE_VALUES, spread)
 
 
-def _picture(values: np.ndarray, moment: Moment, place: Place, pixel: float) -> np.ndarray:
-    """A map in colours, with a bar of them and a scale of lengths."""
+def _picture(
+    values: np.ndarray, moment: Moment, place: Place, pixel: float, areas: Sequence[Area], to_pixels: Any
+) -> np.ndarray:
+    """A map in colours, with a bar of them, a scale of lengths, and the outlines of areas; the first of them with numbers.
+
+    ``to_pixels`` is the affine transform from the map's coordinates to columns and rows.
+    """
     known = values[np.isfinite(values)]
     low, high = bounds_of(known) if len(known) else moment.seen.limits
     step = -(-max(values.shape) // SHOWN)
@@ -285,6 +356,16 @@ def _picture(values: np.ndarray, moment: Moment, place: Place, pixel: float) -> 
     draw = ImageDraw.Draw(page)
     for colour, wide in (("black", 6), ("white", 2)):
         draw.line((MARGIN_PX, page.height - MARGIN_PX, end, page.height - MARGIN_PX), fill=colour, width=wide)
+    for number, area in enumerate(areas, start=1):
+        for ring in (ring for polygon in area.polygons for ring in polygon):
+            draw.line(
+                [tuple(factor / step * x for x in to_pixels * corner) for corner in ring],
+                fill=MARKED,
+                width=max(1, factor // 2),
+            )
+        if number <= NUMBERED:
+            row, column = area.spot
+            lettering(draw, (factor / step * column + 4, factor / step * row), str(number))
     lettering(
         draw, (end + MARGIN_PX, page.height - MARGIN_PX), f"{length:g} {'m' if place.unit == 'metre' else 'units'}"
     )
