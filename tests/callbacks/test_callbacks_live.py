@@ -164,6 +164,20 @@ def test_a_state_that_cannot_be_made_is_told_and_training_goes_on(tmp_path, monk
     )
 
 
+def test_who_stops_it_by_hand_does_not_wait_for_a_state(tmp_path, monkeypatch):
+    made = []
+
+    def none(module):
+        made.append(module.global_step)
+        raise SceneError("no state")
+
+    monkeypatch.setattr(live, "snapshot", none)
+    monkeypatch.setattr(live, "LiveServer", Looking)
+    module = still(FakeModule(wall(), tmp_path))  # of 8 steps
+    fit(module, trainer(tmp_path, [LiveViewer(port=0)], steps=4, every=4))
+    assert 4 not in made and Looking.seen[-1][0]["phase"] == "Training was stopped"
+
+
 def test_states_wait_for_their_seconds_and_their_share(monkeypatch):
     clock = SimpleNamespace(now=100.0)
     monkeypatch.setattr(live, "time", SimpleNamespace(monotonic=lambda: clock.now))

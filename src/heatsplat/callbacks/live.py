@@ -28,7 +28,7 @@ class LiveViewer(pl.Callback):
     A state is made between two steps, from the same Gaussians and to the same accuracy as viewer.html, and only while a browser
     asks for it: training waits meanwhile. It draws no random numbers and changes no parameter, so that weights are the same
     without. Its seconds count as ``cost.watching_seconds``, not as those of training (``CostMeter``). The first state is made as
-    soon as somebody looks, the last one when training ends and somebody does.
+    soon as somebody looks, the last one when training ends and somebody does, unless it was stopped by hand.
 
     Of methods without Gaussians that stay as they are (``ThermalModel.stays_here``) it says that there is none.
 
@@ -95,9 +95,9 @@ class LiveViewer(pl.Callback):
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self._server is None:
             return
-        if self._server.watched(self.idle_s):
-            self._make(trainer, module)
         done = trainer.global_step >= module.schedule.end
+        if done and self._server.watched(self.idle_s):  # who stops it by hand does not want to wait
+            self._make(trainer, module)
         self._server.end("Training has ended" if done else "Training was stopped", self.idle_s)
 
     def teardown(self, trainer: pl.Trainer, module: pl.LightningModule, stage: str) -> None:
@@ -136,13 +136,12 @@ class LiveViewer(pl.Callback):
 
     def _page(self, trainer: pl.Trainer, module: pl.LightningModule) -> str:
         header, block = payload(module, snapshot(module), self.cameras)
-        seconds = module.results.cost.get("train_seconds") if self._meter is None else self._meter.train_seconds
         header["live"] = {
             "run": self._server.run,
             "state": self._states,
             "step": trainer.global_step,
             "steps": module.schedule.end,
-            "seconds": seconds,
+            "seconds": None if self._meter is None else self._meter.train_seconds,
             "scores": self._scores,
         }
         return page(header, block)
