@@ -19,7 +19,6 @@ COST_WORDS: Words = {
     "gaussians": ("Gaussians", ""),
     "warmup_seconds": ("warm-up", "s"),
     "evaluation_seconds": ("validation", "s"),
-    "watching_seconds": ("states for the live viewer", "s"),
     "wall_seconds": ("first to last step", "s"),
 }
 
