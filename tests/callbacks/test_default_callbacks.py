@@ -11,7 +11,8 @@ import yaml
 from fake_run import FakeModule, fit, trainer, wall
 
 FILES = [
-    Path(__file__).resolve().parents[2] / "conf" / "callbacks" / name for name in ("evaluate.yaml", "default.yaml")
+    Path(__file__).resolve().parents[2] / "conf" / "callbacks" / name
+    for name in ("evaluate.yaml", "default.yaml", "live.yaml")
 ]
 ENTRIES = {
     name: entry
@@ -75,7 +76,7 @@ def test_every_key_has_a_comment(file):
 
 
 def test_an_evaluation_has_the_measuring_part():
-    evaluate, default = (yaml.safe_load(file.read_text()) for file in FILES)
+    evaluate, default, _ = (yaml.safe_load(file.read_text()) for file in FILES)
     assert list(evaluate) == [
         "costs",
         "metrics",

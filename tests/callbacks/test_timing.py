@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import pytorch_lightning as pl
 import torch
 from fake_run import FakeModule, evaluate, fit, trainer, wall
 from pytorch_lightning.callbacks import ModelCheckpoint
@@ -60,6 +61,40 @@ def test_compiling_and_evaluation_are_not_training(tmp_path):
     evaluate(module, job)
     assert 10 < module.results.cost["render_fps"] <= 50
     assert module.results.cost["train_seconds"] == cost["train_seconds"]
+
+
+class Aside(pl.Callback):
+    """Waits 50 ms after two of the steps, and once more when training has ended, which counts as something else."""
+
+    def __init__(self, meter):
+        self.meter = meter
+
+    def wait(self, module):
+        with self.meter.apart("watching", module):
+            time.sleep(0.05)
+            work(0.02)
+
+    def on_train_batch_end(self, run, module, *_):
+        if run.global_step in (1, 10):  # while it warms up, and later
+            self.wait(module)
+
+    def on_train_end(self, run, module):
+        self.wait(module)
+
+
+def test_what_is_kept_apart_is_no_training_and_the_phase_goes_on_after_it(tmp_path):
+    module, meter = Slow(wall(), tmp_path), CostMeter()
+    fit(module, trainer(tmp_path, [meter, Aside(meter)], steps=20, every=20))
+    cost = module.results.cost
+    assert 3 * 0.07 <= cost["watching_seconds"] <= 3 * 0.07 + 0.15
+    assert cost["train_seconds"] >= 17 * 0.01 and meter.steps == 17
+    assert cost["cpu_seconds"] <= cost["train_seconds"] - 17 * 0.009
+    parts = ("train_seconds", "warmup_seconds", "evaluation_seconds", "watching_seconds")
+    assert cost["wall_seconds"] == pytest.approx(sum(cost[name] for name in parts))
+    assert cost["steps_per_second"] == pytest.approx(17 / cost["train_seconds"])
+    again = CostMeter()
+    again.load_state_dict(meter.state_dict())
+    assert again.seconds == meter.seconds
 
 
 @pytest.mark.parametrize(("views", "timed"), [(2, [0, 1]), (3, [0, 1, 2]), (6, [0, 1, 3, 4])])

@@ -93,6 +93,8 @@ def words_of(command: str, trained: Path, data: Path, folder: Path) -> list[str]
     if "train.py" in command:
         words += SHORT if "data=" not in command and "experiment=" not in command else SHORT[1:]
         words += [*UNSEEN, "doctor=false", f"hydra.run.dir={folder}/run", f"hydra.sweep.dir={folder}/sweep"]
+        if "callbacks=live" in command:  # another program of the machine may listen there
+            words += ["callbacks.live.port=0"]
         if "budget=" in command:  # which counts the steps itself
             words = [word for word in words if not word.startswith(("max_steps=", "budget="))] + ["budget=20s"]
         if "experiment=" in command:  # some of its methods

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import pytorch_lightning as pl
@@ -56,13 +57,7 @@ class Progress(pl.Callback):
     def on_validation_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self._bar is None or trainer.sanity_checking:
             return
-        found = {
-            key.removeprefix("val/"): float(value) for key, value in trainer.callback_metrics.items() if "val/" in key
-        }
-        words = [f"step {trainer.global_step}:"]
-        for name, text in (("psnr", "PSNR {:.2f} dB"), ("ssim", "SSIM {:.4f}"), ("mae_c", "MAE {:.3g} °C")):
-            if name in found:
-                words.append(text.format(found[name]))
+        words = [f"step {trainer.global_step}:", *scores_told(trainer.callback_metrics)]
         seconds = module.results.cost.get("train_seconds")
         if seconds is not None:
             words.append(f"after {seconds:.{0 if seconds >= 10 else 1}f} s")
@@ -85,3 +80,10 @@ class Progress(pl.Callback):
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+
+def scores_told(metrics: Mapping[str, Any]) -> list[str]:
+    """Scores of a validation in words, such as "PSNR 27.31 dB", of those of Lightning's ``callback_metrics`` that are known."""
+    found = {key.removeprefix("val/"): float(value) for key, value in metrics.items() if "val/" in key}
+    known = (("psnr", "PSNR {:.2f} dB"), ("ssim", "SSIM {:.4f}"), ("mae_c", "MAE {:.3g} °C"))
+    return [text.format(found[name]) for name, text in known if name in found]

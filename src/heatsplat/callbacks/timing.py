@@ -5,6 +5,8 @@ from __future__ import annotations
 import statistics
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +33,15 @@ class CostMeter(pl.Callback):
       was nothing to choose; in none of the others.
     * ``train_seconds``: wall time of training steps, everything that happens in them included (data, render, backward,
       optimiser, density control, callbacks, writing checkpoints). Excluded: validation with its pictures and curves,
-      the test, set-up, and the first ``warmup_steps`` steps after every start, in which kernels are compiled.
+      the test, set-up, the first ``warmup_steps`` steps after every start, in which kernels are compiled, and what a callback
+      keeps ``apart``.
     * ``cpu_seconds``: processor seconds of this process in the same steps, all of its threads added up. A run on one thread
       takes as many beside other runs as alone, but for what they take of caches and memory, so they compare runs of a busy
       machine. On several threads those that wait for work count while they spin (``OMP_WAIT_POLICY=PASSIVE``: they sleep);
       on a GPU they are those of the host.
     * ``steps_per_second``: the steps timed so, by their ``train_seconds``.
     * ``warmup_seconds``, ``evaluation_seconds``: the time of the excluded steps, and of validation during training.
+    * ``watching_seconds``: in which training waited for a state of the live viewer; only of runs that were watched.
     * ``wall_seconds``: all of the training run, from its first step to its end.
     * ``render_fps``: one by the median time of a rendered test view, as ``predict`` gives it.
     * ``peak_memory_mb``: in 10^6 bytes; on a GPU what tensors took at most, otherwise the largest resident memory of
@@ -82,6 +86,18 @@ class CostMeter(pl.Callback):
     @property
     def _training_phase(self) -> str:
         return "warmup" if self._warming else "train"
+
+    @contextmanager
+    def apart(self, phase: str, module: pl.LightningModule) -> Iterator[None]:
+        """Counts what happens in the block as a phase of its own, which then has its ``<phase>_seconds``."""
+        before = None if self._since is None else self._phase
+        self.seconds.setdefault(phase, 0.0)
+        self._switch(phase, module)
+        try:
+            yield
+        finally:
+            self._switch(before, module)
+            self._publish(module)
 
     def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         _reset_peak(module.device)
@@ -151,8 +167,9 @@ class CostMeter(pl.Callback):
             for name in ("train_seconds", "cpu_seconds", "steps_per_second"):
                 put("cost", name, None, f"the run was not longer than its {self.warmup_steps} steps of warm-up")
         put("cost", "choosing_seconds", module.config.get("choosing_seconds", 0.0))
-        put("cost", "warmup_seconds", seconds["warmup"])
-        put("cost", "evaluation_seconds", seconds["evaluation"])
+        for phase, value in seconds.items():
+            if phase != "train":
+                put("cost", f"{phase}_seconds", value)
         put("cost", "wall_seconds", sum(seconds.values()))
         self._publish_peak(module)
         put("cost", "gaussians", len(module.splats))

@@ -22,6 +22,7 @@ SCRIPTS = (
     "payload.js", "camera.js", "splats.js", "sorting.js", "drawing.js", "isotherm.js", "chart.js", "probes.js",
     "areas.js", "compare.js", "controls.js", "viewer.js",
 )  # fmt: skip
+LIVE = "live.js"  # of a page that a run serves while it trains
 
 
 def write_viewer(module: Any, path: Path, cameras: int = CAMERAS) -> Path:
@@ -42,8 +43,9 @@ def write_viewer(module: Any, path: Path, cameras: int = CAMERAS) -> Path:
 
 
 def page(header: dict[str, Any], block: bytes) -> str:
-    """The page of a header and its arrays (``viewer.payload``)."""
-    scripts = "\n".join((SOURCES / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    """The page of a header and its arrays (``viewer.payload``); with ``live`` in the header one that asks for newer states."""
+    names = (*SCRIPTS, LIVE) if "live" in header else SCRIPTS
+    scripts = "\n".join((SOURCES / name).read_text(encoding="utf-8") for name in names)
     parts = {
         "title": html.escape(f"{header['scene']} · {header['method']}"),
         "style": (SOURCES / "viewer.css").read_text(encoding="utf-8"),
