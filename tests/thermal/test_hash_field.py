@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from running import TINY, run
+from threads import with_threads
 
 from heatsplat.composition import build, compose
 from heatsplat.contracts import SceneError
@@ -149,3 +150,18 @@ def test_what_needs_gaussians_is_refused_with_a_remedy(trained):
         begun("method=instant_ngp", "optim=adamw")
     with pytest.raises(SceneError, match="last.ckpt holds a field without Gaussians: give a .ply, or the checkpoint"):
         begun("method=3dgs", "init=pretrained", f"init.path={folder}/checkpoints/last.ckpt")
+
+
+def test_colours_of_many_places_have_the_same_bits_on_any_number_of_threads():
+    model = field(companions={"rgb": 3}, directional=["rgb"])
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in model.heads.parameters():
+            parameter.normal_(generator=generator)
+    known, ways = torch.rand(20_001, 1, generator=generator), torch.rand(20_001, 3, generator=generator)
+    with torch.no_grad():
+        one, *others = with_threads(
+            (1, 2, 3, 7), lambda: model.values(known, ways / ways.norm(dim=1)[:, None], Query(None))
+        )
+    assert one.shape == (20_001, 4) and one.std(0).min() > 0
+    assert all(torch.equal(one, other) for other in others)

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from running import TINY, run
+from threads import with_threads
 
 from heatsplat.composition import build, compose
 from heatsplat.contracts import Camera, SceneError
@@ -173,3 +174,28 @@ def test_values_of_anchors_are_those_of_all_their_gaussians(trained):
     assert torch.allclose(
         shown.features[..., 0], 0.5 * shown.alpha[0] + (1 - shown.alpha[0]) * module.background, atol=1e-5
     )
+
+
+def test_many_anchors_give_and_learn_the_same_bits_on_any_number_of_threads():
+    count = 7001  # times ten Gaussians are more than torch leaves to one thread, and shares end inside vectors
+    generator = torch.Generator().manual_seed(3)
+    places = torch.rand(count, 3, generator=generator) * torch.tensor([2.0, 2.0, 1.0]) + torch.tensor([-1.0, -1.0, 4.0])
+    model, splats = anchors(*places.tolist(), gaussians=10, feature_size=8)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.normal_(0.0, 0.5, generator=generator)
+        splats["feature"].normal_(generator=generator)
+
+    def results():
+        made, values = seen(model, splats)
+        loss = sum(x.sum(-1).double().square().mean() for x in (made.scales, made.opacities.mT, values))
+        loss = loss + 1e6 * model.regularisers(splats)["volume"]
+        learned = dict(model.named_parameters())
+        slopes = torch.autograd.grad(loss, list(learned.values()))
+        found = {"scales": made.scales, "opacities": made.opacities, "values": values}
+        return {name: x.detach() for name, x in found.items()} | dict(zip(learned, slopes, strict=True))
+
+    one, *others = with_threads((1, 2, 3, 7), results)
+    assert all(found.any() for found in one.values())
+    for other in others:
+        assert not [name for name, found in one.items() if not torch.equal(found, other[name])]

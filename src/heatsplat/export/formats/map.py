@@ -240,9 +240,8 @@ class Map(Format):
             there = torch.from_numpy(np.isfinite(known[first : first + rows]))
             view = partial(moment.module.renderer.values_seen, shapes, camera=strip)
             depth, spread = closest_depth(view, seen.means, strip, there)
-            found.append(
-                (top - place.scale * depth.double()).where(spread * place.scale < beyond, torch.nan)
-            )  # else it is fog
+            clear = spread * place.scale < beyond  # else it is fog
+            found.append((top - place.scale * depth.double()).where(clear, torch.nan))
         heights = torch.cat(found)
         return heights.where((heights > low - beyond) & (heights < high + beyond), torch.nan).numpy()
 
