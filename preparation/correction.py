@@ -174,8 +174,8 @@ def correct(
     boxes = [] if regions is None else read_regions(found_file(OPTION, regions, None))
     recorded = {"downscale": downscale, "degrade": "null", "upsample": "null"}  # a run may have been given less
     trained = load(ckpt, data=recorded, trust=trust)
-    root = Path(trained.config["data"]["root"] or ".")
-    folders = [root, root / str(trained.config["data"].get("scene"))]
+    root = trained.config["data"]["root"]  # of a synthetic scene there is none, and no preparation
+    folders = [] if root is None else [Path(root), Path(root) / str(trained.config["data"].get("scene"))]
     return correct_scene(
         trained.scene,
         trained.depth,

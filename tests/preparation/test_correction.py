@@ -4,6 +4,7 @@ import csv
 import json
 import weakref
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -312,6 +313,21 @@ def test_positions_tell_the_scale_where_the_scene_does_not(monkeypatch, own, sca
     settings = {"conditions": {}, "band_um": (8, 14), "refractive_index": None}
     assert correction.correct("a.ckpt", None, metres_per_unit=None, **settings) == scale
     assert correction.correct("a.ckpt", None, metres_per_unit=7.0, **settings) == 7.0
+
+
+def test_the_working_folder_is_no_preparation_of_a_scene_without_a_folder(tmp_path, monkeypatch):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "0.json").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    floor = SimpleNamespace(metres_per_unit=1.0, name="floor")
+    given = {"root": None, "scene": "floor"}
+    trained = SimpleNamespace(config={"data": given}, scene=floor, depth=None)
+    monkeypatch.setattr(correction, "load", lambda ckpt, **_: trained)
+    monkeypatch.setattr(correction, "correct_scene", lambda *given: given[2])
+    settings = {"conditions": {}, "band_um": (8, 14), "refractive_index": None, "metres_per_unit": None}
+    assert correction.correct("a.ckpt", tmp_path / "corrected", **settings) == []
+    given["root"] = "data"
+    assert correction.correct("a.ckpt", tmp_path / "corrected", **settings) == [Path("data"), Path("data/floor")]
 
 
 def test_the_scene_itself_is_no_target(tmp_path):
