@@ -45,7 +45,7 @@ def areas_of(values: np.ndarray, isotherm: tuple[float, float], grid: Any, least
     Args:
         values: [H, W], NaN where nothing is known, which belongs to no area.
         isotherm: lowest and highest value, of which one may be infinite.
-        grid: affine transform from columns and rows to the map's coordinates.
+        grid: affine transform from columns and rows to the map's coordinates, north up.
         least: size of the smallest, in squares of the map's unit; None: four pixels.
 
     Raises:
@@ -85,7 +85,7 @@ def write_areas(
     Args:
         path: of the map.
         areas: of the map.
-        grid: affine transform from columns and rows to the map's coordinates.
+        grid: affine transform from columns and rows to the map's coordinates, north up.
         place: of the map.
         unit: of its values, "°C" or "".
         heights: [H, W] of the surface in the map's unit, NaN where it is not known; None leaves them out.
@@ -96,7 +96,7 @@ def write_areas(
     of_values, of_size = "_c" if unit == "°C" else "", "m2" if place.unit == "metre" else "square_units"
     rows = []
     for number, area in enumerate(areas, start=1):
-        x, y = grid * (area.spot[1] + 0.5, area.spot[0] + 0.5)
+        x, y = grid.c + (area.spot[1] + 0.5) * grid.a, grid.f + (area.spot[0] + 0.5) * grid.e
         row = {"number": number, f"area_{of_size}": float(f"{area.size:.6g}")}
         row |= {f"mean{of_values}": area.mean, f"min{of_values}": area.least, f"max{of_values}": area.most}
         row |= {"spot_x": x, "spot_y": y}

@@ -171,7 +171,7 @@ class Map(Format):
             files = write_areas(path, areas, grid, place, moment.seen.unit, heights)
             log.info("%s: %d %s", files[-1], len(areas), "area" if len(areas) == 1 else "areas")
         if other is None:
-            picture = _picture(own, moment, place, pixel, areas, ~grid)
+            picture = _picture(own, moment, place, pixel, areas, grid)
         else:
             _say_shift(other, own, pixel, place.unit, moment.seen.unit, self.against)
             recorded, owner = mosaic(scene, surface_points(camera, smoothed(depth)))
@@ -337,11 +337,11 @@ def _compared(
 
 
 def _picture(
-    values: np.ndarray, moment: Moment, place: Place, pixel: float, areas: Sequence[Area], to_pixels: Any
+    values: np.ndarray, moment: Moment, place: Place, pixel: float, areas: Sequence[Area], grid: Any
 ) -> np.ndarray:
     """A map in colours, with a bar of them, a scale of lengths, and the outlines of areas; the first of them with numbers.
 
-    ``to_pixels`` is the affine transform from the map's coordinates to columns and rows.
+    ``grid`` is the affine transform from columns and rows to the map's coordinates, north up.
     """
     known = values[np.isfinite(values)]
     low, high = bounds_of(known) if len(known) else moment.seen.limits
@@ -355,16 +355,14 @@ def _picture(
     draw = ImageDraw.Draw(page)
     for colour, wide in (("black", 6), ("white", 2)):
         draw.line((MARGIN_PX, page.height - MARGIN_PX, end, page.height - MARGIN_PX), fill=colour, width=wide)
+    shrunk = factor / step
     for number, area in enumerate(areas, start=1):
         for ring in (ring for polygon in area.polygons for ring in polygon):
-            draw.line(
-                [tuple(factor / step * x for x in to_pixels * corner) for corner in ring],
-                fill=MARKED,
-                width=max(1, factor // 2),
-            )
+            corners = [(shrunk * (x - grid.c) / grid.a, shrunk * (y - grid.f) / grid.e) for x, y in ring]
+            draw.line(corners, fill=MARKED, width=max(1, factor // 2))
         if number <= NUMBERED:
             row, column = area.spot
-            lettering(draw, (factor / step * column + 4, factor / step * row), str(number))
+            lettering(draw, (shrunk * column + 4, shrunk * row), str(number))
     lettering(
         draw, (end + MARGIN_PX, page.height - MARGIN_PX), f"{length:g} {'m' if place.unit == 'metre' else 'units'}"
     )
