@@ -34,7 +34,7 @@ class States:
     modules: list[Any]
     server: LiveServer
 
-    def show(self, number: int, run_id: str | None = None) -> None:
+    def show(self, number: int) -> None:
         module = self.modules[number - 1]
         header, block = payload(module, snapshot(module), 2)
         told = {
@@ -44,7 +44,7 @@ class States:
             "seconds": 1.25 * number,
             "scores": "PSNR 27.31 dB at step 30",
         }
-        self.server.show(page(header | {"live": told | {"run": run_id or self.server.run}}, block), number)
+        self.server.show(page(header | {"live": told | {"run": self.server.run}}, block), number)
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +154,12 @@ def test_what_keeps_a_newer_state_away_is_told(browser, states):
     states.show(1)
     page = shown(browser, states)
     states.server.tell(problem="none can be seen")
-    wait_until(page, "/^no newer state: none can be seen/.test(live.line.textContent)")
+    wait_until(page, "/^no newer state/.test(live.line.textContent)")
+    assert line(page).startswith("no newer state: none can be seen · step 30 of 1,200")
+    assert page.execute_script("return [live.state, live.over]") == [1, False]  # it goes on asking
+    states.server.tell(problem="")
+    wait_until(page, "/^step 30/.test(live.line.textContent)")
+    assert line(page).startswith("step 30 of 1,200")
 
 
 def test_a_page_that_nobody_sees_asks_for_nothing(browser, states):
