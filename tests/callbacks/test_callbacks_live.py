@@ -19,6 +19,7 @@ from heatsplat.callbacks import live
 from heatsplat.callbacks.live import LiveViewer
 from heatsplat.composition import compose
 from heatsplat.contracts import SceneError
+from heatsplat.export.snapshot import TOLERANCE_C
 from heatsplat.viewer.live import LiveServer
 from heatsplat.viewer.page import FILE, LIVE, SOURCES
 
@@ -86,6 +87,8 @@ def test_states_are_served_one_after_the_other_with_what_is_known_of_them(watche
     last = list(pages.values())[-1]
     assert last["live"]["steps"] == 60 and last["count"] > 0 and len(last["cameras"]) == 2
     assert re.fullmatch(r"PSNR \d+\.\d\d dB, SSIM \d\.\d+, MAE .* °C at step 60", last["live"]["scores"])
+    aims = [layer["aim"] for layer in last["layers"] if layer["name"] == "camera"]
+    assert aims == pytest.approx([4 * TOLERANCE_C]) and last["layers"][0]["worst"] <= aims[0]
     assert seen[-1][0]["phase"] == "Training has ended" and seen[-1][0]["state"] == last["live"]["state"]
 
 
@@ -104,7 +107,7 @@ def test_its_seconds_are_told_and_are_none_of_training(watched, unwatched):
 
 
 def test_a_page_that_is_not_open_costs_nothing(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(live, "snapshot", lambda _: pytest.fail("nobody looks"))
+    monkeypatch.setattr(live, "snapshot", lambda *_: pytest.fail("nobody looks"))
     with caplog.at_level(logging.INFO, "heatsplat"):
         module, _ = run(tmp_path, *SHORT, *WATCHED)
     assert "watching_seconds" not in module.results.cost
@@ -151,7 +154,7 @@ def test_of_methods_whose_gaussians_change_there_is_none_and_it_is_said(tmp_path
 
 
 def test_a_state_that_cannot_be_made_is_told_and_training_goes_on(tmp_path, monkeypatch):
-    def none(_):
+    def none(*_):
         raise SceneError("none of the 300 Gaussians can be seen")
 
     monkeypatch.setattr(live, "snapshot", none)
@@ -167,7 +170,7 @@ def test_a_state_that_cannot_be_made_is_told_and_training_goes_on(tmp_path, monk
 def test_who_stops_it_by_hand_does_not_wait_for_a_state(tmp_path, monkeypatch):
     made = []
 
-    def none(module):
+    def none(module, _):
         made.append(module.global_step)
         raise SceneError("no state")
 
@@ -200,6 +203,7 @@ def test_states_wait_for_their_seconds_and_their_share(monkeypatch):
         ({"port": 65536}, "port must be 65535 or less, got 65536"),
         ({"share": 1.5}, "share must be 1 or less"),
         ({"every_s": 0}, "every_s must"),
+        ({"coarser": 0}, "coarser must be above 0"),
     ],
 )
 def test_settings_out_of_range_are_refused_by_name(settings, told):

@@ -13,17 +13,26 @@ from heatsplat.export.basis import CHECKS, _curves, _directions, _telling, const
 COUNT = 200
 
 
+def moment_by_moment(value_at):
+    """Values at moments, of all or some Gaussians, from those of all at a moment."""
+
+    def values_at(moments, ids: torch.Tensor | None = None) -> torch.Tensor:
+        every = map(value_at, moments)
+        return torch.stack([values if ids is None else values[ids] for values in every])
+
+    return values_at
+
+
 def bodies(seed: int = 0):
     """Values of bodies that relax at rates of their own and are heated at two frequencies."""
     generator = torch.Generator().manual_seed(seed)
     rates = torch.logspace(-2, 1, COUNT)
     start, gains = torch.rand(COUNT, generator=generator), 0.1 * torch.randn(COUNT, 2, generator=generator)
 
-    def values_at(time: float, ids: torch.Tensor | None = None) -> torch.Tensor:
-        values = start * torch.exp(-rates * time) + gains[:, 0] * math.sin(3 * time) + gains[:, 1] * math.cos(7 * time)
-        return values if ids is None else values[ids]
+    def value_at(time: float) -> torch.Tensor:
+        return start * torch.exp(-rates * time) + gains[:, 0] * math.sin(3 * time) + gains[:, 1] * math.cos(7 * time)
 
-    return values_at
+    return moment_by_moment(value_at)
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
@@ -31,18 +40,26 @@ def test_the_worst_error_is_below_what_was_asked_and_is_told(tolerance):
     values_at = bodies()
     basis = time_basis(values_at, COUNT, 0.0, 4.0, tolerance)
     assert 0 < basis.worst <= tolerance
-    errors = [(basis.at(time) - values_at(time)).abs().max().item() for time in torch.linspace(0, 4, 321).tolist()]
+    errors = [(basis.at(time) - values_at([time])[0]).abs().max().item() for time in torch.linspace(0, 4, 321).tolist()]
     assert max(errors) <= 1.5 * tolerance  # moments at which it never looked
     assert max(errors) > 0.1 * tolerance  # and it is no larger than it must be
     assert basis.rank < 16
 
 
 def test_a_kink_gets_samples_and_a_flat_stretch_does_not():
-    basis = time_basis(lambda time, ids: torch.full((3,), max(time - 0.7, 0.0)), 3, 0.0, 1.0, 1e-4)
+    basis = time_basis(moment_by_moment(lambda time: torch.full((3,), max(time - 0.7, 0.0))), 3, 0.0, 1.0, 1e-4)
     assert basis.rank == 1
     near = ((basis.times_s - 0.7).abs() < 0.02).sum()
     assert near >= 4 and len(basis.times_s) < 60
     assert basis.at(0.7).abs().max() < 1e-4
+
+
+def test_a_jump_has_two_samples_close_together_and_ends():
+    """Halved without end, samples did not run out: a middle between two neighbouring floats is one of them."""
+    basis = time_basis(moment_by_moment(lambda time: torch.tensor([float(time > 0.7), 1.0])), 2, 0.0, 1.0, 1e-4)
+    assert basis.times_s.diff().min() < 2e-6 and len(basis.times_s) < 80
+    for time, value in ((0.0, 0.0), (0.7 - 2e-6, 0.0), (0.7 + 2e-6, 1.0), (1.0, 1.0)):
+        assert basis.at(time).tolist() == pytest.approx([value, 1.0], abs=1e-4)
 
 
 def test_bends_that_are_known_are_samples():
@@ -51,28 +68,24 @@ def test_bends_that_are_known_are_samples():
     at = torch.rand(60, generator=generator, dtype=torch.float64).sort().values.tolist()
     heights = torch.randn(60, generator=generator, dtype=torch.float64).tolist()
 
-    def values_at(time: float, ids: torch.Tensor | None) -> torch.Tensor:
-        return torch.tensor([float(np.interp(time, at, heights))])
-
+    values_at = moment_by_moment(lambda time: torch.tensor([float(np.interp(time, at, heights))]))
     known, unknown = (time_basis(values_at, 1, 0.0, 1.0, 1e-3, 170, bends=bends) for bends in (at, ()))
     assert set(at) <= set(known.times_s.tolist())
     moments = torch.linspace(0, 1, 397).tolist()
-    errors = [max((b.at(t) - values_at(t, None)).abs().item() for t in moments) for b in (known, unknown)]
+    errors = [max((b.at(t) - values_at([t])[0]).abs().item() for t in moments) for b in (known, unknown)]
     assert errors[0] < 1e-3 < 0.1 < errors[1] and unknown.worst > 0.1  # where samples run out, the error is told
     assert set(at) - set(time_basis(values_at, 1, 0.0, 1.0, 1e-3, 100, bends=at).times_s.tolist())  # too many for it
 
 
 def test_errors_of_what_is_clipped_are_those_after_clipping():
-    def values_at(time: float, ids: torch.Tensor | None) -> torch.Tensor:
-        return torch.tensor([0.5 + 0.1 * time, 5.0 + math.sin(40 * time)])
-
+    values_at = moment_by_moment(lambda time: torch.tensor([0.5 + 0.1 * time, 5.0 + math.sin(40 * time)]))
     plain, clipped = (time_basis(values_at, 2, 0.0, 1.0, 1e-4, 40, clipped=clipped) for clipped in (False, True))
     assert len(clipped.times_s) < len(plain.times_s) and clipped.worst < 1e-4 < plain.worst
 
 
 def test_what_does_not_change_has_no_curve():
     values = torch.rand(5)
-    for basis in (time_basis(lambda time, ids: values, 5, 0.0, 9.0, 0.01), constant_basis(values)):
+    for basis in (time_basis(moment_by_moment(lambda _: values), 5, 0.0, 9.0, 0.01), constant_basis(values)):
         assert (basis.rank, basis.worst) == (0, 0.0)
         assert torch.equal(basis.at(3.0), values) and torch.equal(basis.at(None), values)
 
@@ -111,12 +124,15 @@ def many(count: int, odd: tuple[int, ...]):
     rates, start = torch.rand(count, generator=generator) * 3, torch.rand(count, generator=generator)
     asked: list[int] = []
 
-    def values_at(time: float, ids: torch.Tensor | None = None) -> torch.Tensor:
+    def value_at(time: float) -> torch.Tensor:
         values = start * torch.exp(-rates * time) + 0.1 * math.sin(2 * time)
         for number, one in enumerate(odd):
             values[one] += math.exp(-((time - 0.5 - number) ** 2) / 0.01)
-        asked.append(count if ids is None else len(ids))
-        return values if ids is None else values[ids]
+        return values
+
+    def values_at(moments, ids: torch.Tensor | None = None) -> torch.Tensor:
+        asked.extend([count if ids is None else len(ids)] * len(moments))
+        return moment_by_moment(value_at)(moments, ids)
 
     return values_at, asked
 
@@ -130,7 +146,7 @@ def test_of_many_gaussians_few_are_sampled_and_the_odd_ones_are_found(monkeypatc
     whole = sum(number == count for number in asked)
     assert whole < 250 < len(basis.times_s) < len(asked) - whole  # most samples are of few Gaussians
     every = torch.linspace(0, 4, 801).tolist()
-    errors = torch.stack([(basis.at(time) - values_at(time)).abs() for time in every]).amax(0)
+    errors = torch.stack([(basis.at(time) - values_at([time])[0]).abs() for time in every]).amax(0)
     assert basis.worst <= 1e-3 and errors.max() <= 1.5e-3
     alone = time_basis(many(count, odd=())[0], count, 0.0, 4.0, 1e-3, 513)
     assert alone.rank < basis.rank  # the odd ones have curves
@@ -148,6 +164,7 @@ def test_of_many_gaussians_no_table_holds_all_moments_of_all(monkeypatch):
 
     monkeypatch.setattr("heatsplat.export.basis.EXAMINED", 50)
     monkeypatch.setattr("heatsplat.export.basis.ROWS", 128)
+    monkeypatch.setattr("heatsplat.export.basis.CELLS", count)
     with Sizes():
         found = time_basis(many(count, odd=())[0], count, 0.0, 1.0, 1e-3, most_times=65)
     assert found.rank >= 2 and max(sizes) < count * (found.rank + 2) < count * CHECKS

@@ -43,6 +43,14 @@ def test_emission_over_time_is_that_of_the_model(tmp_path, composite):
         assert (found - expected.clamp(*seen.limits)).abs().max() <= 1.2 * TOLERANCE
 
 
+def test_a_coarser_one_has_fewer_samples_and_keeps_to_what_it_aims_at(tmp_path):
+    module = started_alone(tmp_path, "method=etgs", "thermal.frequencies=4")
+    fine, coarse = (snapshot(module, coarser).layers[0] for coarser in (1.0, 8.0))
+    assert (fine.tolerance, coarse.tolerance) == pytest.approx((TOLERANCE, 8 * TOLERANCE))
+    assert fine.worst <= TOLERANCE < coarse.worst <= 8 * TOLERANCE
+    assert len(coarse.basis.times_s) < len(fine.basis.times_s)
+
+
 @pytest.mark.parametrize("clipped", [True, False])
 def test_a_gaussian_far_beyond_the_range_leaves_the_others_their_temperatures(tmp_path, clipped):
     module = started_alone(tmp_path, "method=etgs", "thermal.frequencies=0", "composite=stefan_boltzmann")

@@ -188,7 +188,21 @@ def test_views_in_any_order_see_what_a_march_of_their_own_finds(climate, surface
     course = Course(climate, surface)
     for time in (0.0, 5000.0, 5000.0, 40_000.0, 9000.0, 86_400.0):
         alone = stepped_temperature(climate, rows(surface, ids), time)
-        torch.testing.assert_close(course.temperature(time, ids), alone, atol=2e-4, rtol=0)
+        torch.testing.assert_close(course.temperatures([time], ids)[0], alone, atol=2e-4, rtol=0)
+
+
+@pytest.mark.parametrize("room", [marching.COURSE_BYTES, 20_000])
+def test_moments_that_are_asked_for_together_see_the_same(climate, surface, monkeypatch, room):
+    """Some side by side, some far apart, the first and the last of the record."""
+    monkeypatch.setattr(marching, "COURSE_BYTES", room)
+    times = climate.drivers.times_s.tolist()
+    times = [times[0], 5000.0, 5100.0, 5900.0, 40_000.0, 40_001.0, *times[80:90], times[-1]]
+    for ids in (None, torch.arange(1, COUNT, 4)):
+        found = Course(climate, surface).temperatures(times, ids)
+        course = Course(climate, surface)
+        alone = torch.cat([course.temperatures([time], ids) for time in times])
+        torch.testing.assert_close(found, alone, atol=2e-4, rtol=0)
+        assert (found[1:] - found[:-1]).abs().amax(1).min() > 0  # they differ
 
 
 def test_what_surfaces_have_forgotten_of_a_long_record_is_not_marched(surface, monkeypatch):

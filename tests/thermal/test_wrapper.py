@@ -79,7 +79,11 @@ class Probe(ThermalModel):
         return MOVED
 
     def temperature(self, splats, time_s, ids=None):
-        return torch.full((COUNT,), 321.0)
+        return torch.full((COUNT,), 321.0 + time_s)
+
+    def temperatures(self, splats, times_s, ids=None):
+        self.told.append("times together")
+        return super().temperatures(splats, times_s, ids)
 
     @property
     def removable(self):
@@ -206,6 +210,10 @@ def test_what_the_model_inside_answers_comes_out(wrapped):
     assert (model.start_opacity, model.averaged) == (0.35, 0.75) and model.geometry(splats, QUERY) is MOVED
     if not isinstance(model, ThroughAir):  # whose surfaces are warmer than they are seen
         assert torch.equal(model.temperature(splats, 5.0), probe.temperature(splats, 5.0))
+    together = model.temperatures(splats, [5.0, 9.0])
+    assert torch.equal(together, torch.stack([model.temperature(splats, time_s) for time_s in (5.0, 9.0)]))
+    if all(type(one).temperature is Wrapper.temperature for one in model.modules() if isinstance(one, Wrapper)):
+        assert probe.told[-1] == "times together"
     if not isinstance(model, Composed):  # which has parts of its own to leave out
         assert model.removable == ("needle",)
         with model.without("needle"):

@@ -25,10 +25,10 @@ MOST_PORT = 65535
 class LiveViewer(pl.Callback):
     """Serves viewer.html of the state of training, which the page replaces by newer ones while it is open.
 
-    A state is made between two steps, from the same Gaussians and to the same accuracy as viewer.html, and only while a browser
-    asks for it: training waits meanwhile. It draws no random numbers and changes no parameter, so that weights are the same
-    without. Its seconds count as ``cost.watching_seconds``, not as those of training (``CostMeter``). The first state is made as
-    soon as somebody looks, the last one when training ends and somebody does, unless it was stopped by hand.
+    A state is made between two steps, from all Gaussians, and only while a browser asks for it: training waits meanwhile. It
+    draws no random numbers and changes no parameter, so that weights are the same without. Its seconds count as
+    ``cost.watching_seconds``, not as those of training (``CostMeter``). The first state is made as soon as somebody looks, the
+    last one when training ends and somebody does, unless it was stopped by hand.
 
     Of methods without Gaussians that stay as they are (``ThermalModel.stays_here``) it says that there is none.
 
@@ -39,6 +39,7 @@ class LiveViewer(pl.Callback):
         share: of the time since the start that states may take, above 0 and at most 1, but for the first and the last one.
         idle_s: seconds after the last request in which the page counts as open. It asks every two.
         cameras: how many training cameras are in the page at most, with small images.
+        coarser: how many times as far as in viewer.html temperatures over time may be from the model's.
 
     Raises:
         SceneError: a setting is out of range; with the start of training, where the port is taken.
@@ -52,17 +53,19 @@ class LiveViewer(pl.Callback):
         share: float = 0.05,
         idle_s: float = 30.0,
         cameras: int = 12,
+        coarser: float = 4.0,
     ) -> None:
         check_count("callbacks.live.port", port, 0)
         check_count("callbacks.live.cameras", cameras)
-        for name, value in (("every_s", every_s), ("share", share), ("idle_s", idle_s)):
+        settings = {"every_s": every_s, "share": share, "idle_s": idle_s, "coarser": coarser}
+        for name, value in settings.items():
             check_numbers(f"callbacks.live.{name}", value, error=SceneError, above=0)
         if port > MOST_PORT:
             raise SceneError(f"callbacks.live.port must be {MOST_PORT} or less, got {port}")
         if share > 1:
             raise SceneError(f"callbacks.live.share must be 1 or less, the share of the run's time, got {share}")
         self.port, self.host, self.cameras = port, host, cameras
-        self.every_s, self.share, self.idle_s = every_s, share, idle_s
+        self.every_s, self.share, self.idle_s, self.coarser = every_s, share, idle_s, coarser
         self._server: LiveServer | None = None
         self._meter: CostMeter | None = None
         self._began = self._ended = 0.0  # of training, and of the last state
@@ -135,7 +138,7 @@ class LiveViewer(pl.Callback):
         self._spent += self._last
 
     def _page(self, trainer: pl.Trainer, module: pl.LightningModule) -> str:
-        header, block = payload(module, snapshot(module), self.cameras)
+        header, block = payload(module, snapshot(module, self.coarser), self.cameras)
         header["live"] = {
             "run": self._server.run,
             "state": self._states,

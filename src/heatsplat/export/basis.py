@@ -21,13 +21,18 @@ AMPLIFIED = 8.0  # what errors at the moments that tell coefficients may grow by
 OVERSAMPLED = 16  # of the subspace in which singular vectors are sought: more than are wanted, and
 TURNED = 2  # how often it is turned towards the values
 ROWS = 16384  # Gaussians that are fitted together
+CELLS = 1 << 20  # values that are asked for at once: some moments of few Gaussians, or one of many
+NARROWEST = 1e-6  # of the span: intervals that are halved no further, where values jump
+ALIKE = (
+    1 / 4
+)  # of the worst error, from which on intervals are halved together: smooth ones err by as much, half as wide
 STEPS = 32767  # of a coefficient of 16 bits, to each side
 WEIGHED = 4  # times that Gaussians with larger errors get more weight in the curves
 # Shares of the tolerance: between samples, for want of curves, of a step of coefficients; and what may be found at checks, of
 # which there are few.
 BENT, LACKING, ROUNDED, FOUND = 1 / 3, 1 / 3, 1 / 2, 0.7
 
-ValuesAt = Callable[[float, Tensor | None], Tensor]
+ValuesAt = Callable[[Sequence[float], Tensor | None], Tensor]  # values [T, n] at moments
 
 
 @dataclass(frozen=True)
@@ -104,7 +109,8 @@ def time_basis(
     ``most_curves`` or TURNS ended it, that may be more than the tolerance.
 
     Args:
-        values_at: gives the values at a moment in seconds, of the Gaussians whose numbers it gets [n], or of all.
+        values_at: gives the values [T, n] at moments in seconds, increasing, of the Gaussians whose numbers it gets [n], or
+            of all.
         count: N, how many there are.
         first_s, last_s: span of time.
         tolerance: in units of the values.
@@ -119,14 +125,20 @@ def time_basis(
     if FIRST + len(inside) <= most_times // 2:
         moments = sorted({*moments, *inside})
 
-    def found_at(moment: float, ids: Tensor | None = None) -> Tensor:
-        return values_at(moment, ids).detach().float().cpu()
+    def found_at(moments: Iterable[float], ids: Tensor | None = None) -> dict[float, Tensor]:
+        found, wanted = {}, sorted(set(moments))
+        together = max(1, CELLS // (count if ids is None else max(len(ids), 1)))
+        for first in range(0, len(wanted), together):
+            some = wanted[first : first + together]
+            found |= zip(some, values_at(some, ids).detach().float().cpu(), strict=True)
+        return found
 
     def errors(found: Tensor, true: Tensor) -> Tensor:
         return ((found.clamp(0, 1) - true.clamp(0, 1)) if clipped else found - true).abs()
 
     drawn = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:EXAMINED].sort().values
-    samples = _Samples(found_at, drawn, moments, BENT * tolerance, most_times, errors)
+    narrowest = NARROWEST * (last_s - first_s)
+    samples = _Samples(found_at, drawn, moments, BENT * tolerance, most_times, errors, narrowest)
     fitted: dict[float, Tensor] = {}  # moment -> values of all
     best, checked = None, 0
     for _ in range(TURNS):
@@ -139,13 +151,13 @@ def time_basis(
             fitted = dict(samples.seen)
         else:
             told = [basis._curves_at(moment) for moment in fitted]
-            for place in _telling(curves, torch.stack(told, 1) if told else curves[:, :0]):
-                fitted[times[place].item()] = found_at(times[place].item())
+            places = _telling(curves, torch.stack(told, 1) if told else curves[:, :0])
+            fitted |= found_at(times[places].tolist())
         basis = _fit(basis, fitted)
         checks = _between(times, range(checked + 1, checked + CHECKS + 1))
         checks += [a + share * (b - a) for a, b in rough[: ROUGHEST // 2] for share in (0.25, 0.75)]
         checked += CHECKS
-        fitted |= {moment: found_at(moment) for moment in checks}
+        fitted |= found_at(checks)
         off = _errors(basis, fitted, errors)
         known = errors(basis.offsets[samples.ids, None] + basis.coefficients[samples.ids] @ curves, values).amax(1)
         basis = replace(basis, worst=max(off.max().item(), known.max().item()), checks=len(checks))
@@ -163,59 +175,73 @@ class _Samples:
     """Values of some Gaussians at moments that are as close as these need.
 
     Args:
-        found_at: values at a moment of the Gaussians with these numbers.
+        found_at: values at moments of the Gaussians with these numbers, by moment.
         ids: [n] their numbers.
         moments: in increasing order, to begin with.
         tolerance: how far the middle of an interval may be from the straight line between its ends.
         most: moments at most.
         errors: of values against true ones.
+        narrowest: seconds that an interval keeps at least.
     """
 
     def __init__(
-        self, found_at: Callable, ids: Tensor, moments: Sequence[float], tolerance: float, most: int, errors: Callable
+        self,
+        found_at: Callable,
+        ids: Tensor,
+        moments: Sequence[float],
+        tolerance: float,
+        most: int,
+        errors: Callable,
+        narrowest: float,
     ) -> None:
         self.found_at, self.ids, self.moments = found_at, ids, moments
-        self.tolerance, self.most, self.errors = tolerance, most, errors
-        self.seen = {moment: found_at(moment, ids) for moment in moments}
+        self.tolerance, self.most, self.errors, self.narrowest = tolerance, most, errors, narrowest
+        self.seen: dict[float, Tensor] = found_at(moments, ids)
 
     def add(self, ids: Tensor) -> None:
         """Examines more Gaussians."""
         self.ids = torch.cat([self.ids, ids])
-        for moment in sorted(self.seen):
-            self.seen[moment] = torch.cat([self.seen[moment], self.found_at(moment, ids)])
+        for moment, values in self.found_at(self.seen, ids).items():
+            self.seen[moment] = torch.cat([self.seen[moment], values])
 
     def refine(self) -> list[tuple[float, float]]:
         """Halves intervals, the worst first. Returns those that are left when the samples run out, the worst first."""
         queue: list[tuple[float, float, float]] = []
         left: list[tuple[float, float]] = []
 
-        def halve(start: float, end: float) -> bool:
-            middle = 0.5 * (start + end)
-            if middle not in self.seen:
-                if len(self.seen) >= self.most:
-                    return False
-                self.seen[middle] = self.found_at(middle, self.ids)
-            line = 0.5 * (self.seen[start] + self.seen[end])
-            error = self.errors(line, self.seen[middle]).max().item()
-            if error > self.tolerance:
-                heapq.heappush(queue, (-error, start, end))
-            return True
+        def look(intervals: list[tuple[float, float]]) -> None:
+            """Queues those that are not straight, as far as their middles can be known."""
+            middles = dict.fromkeys(0.5 * (start + end) for start, end in intervals)
+            new = [middle for middle in middles if middle not in self.seen]
+            self.seen |= self.found_at(new[: max(self.most - len(self.seen), 0)], self.ids)
+            for start, end in intervals:
+                if (middle := self.seen.get(0.5 * (start + end))) is not None:
+                    line = 0.5 * (self.seen[start] + self.seen[end])
+                    error = self.errors(line, middle).max().item()
+                    if error > self.tolerance and end - start > self.narrowest:
+                        heapq.heappush(queue, (-error, start, end))
 
         if all(torch.equal(self.seen[self.moments[0]], values) for values in self.seen.values()):
             return left
-        for start, end in zip(self.moments, self.moments[1:], strict=False):
-            halve(start, end)
+        look(list(zip(self.moments, self.moments[1:], strict=False)))
         while queue:
-            _, start, end = heapq.heappop(queue)
-            middle = 0.5 * (start + end)
-            if not (halve(start, middle) and halve(middle, end)):
-                left.append((start, end))
+            worst, least = [], ALIKE * queue[0][0]
+            while queue and queue[0][0] <= least:
+                worst.append(heapq.heappop(queue)[1:])
+            look([half for whole in worst for half in _halves(*whole)])
+            left += [whole for whole in worst if not all(0.5 * sum(half) in self.seen for half in _halves(*whole))]
         return left
 
     def table(self) -> tuple[Tensor, Tensor]:
         """Moments [T], float64 and increasing, and the values [n, T] at each."""
         times = sorted(self.seen)
         return torch.tensor(times, dtype=torch.float64), torch.stack([self.seen[moment] for moment in times], dim=1)
+
+
+def _halves(start: float, end: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The two halves of an interval."""
+    middle = 0.5 * (start + end)
+    return (start, middle), (middle, end)
 
 
 def _between(times: Tensor, numbers: Iterable[int]) -> list[float]:

@@ -115,11 +115,15 @@ class Snapshot:
 
 
 @torch.no_grad()
-def snapshot(module: Any) -> Snapshot:
+def snapshot(module: Any, coarser: float = 1.0) -> Snapshot:
     """Takes one of a training module (``training.scene_model.SceneModel``) with its scene.
 
     What the Gaussians send may depend on where it is seen from. Then it is the mean over training cameras, and
     ``left_out`` says over which, and how far single cameras are from it, at worst, too.
+
+    Args:
+        module: with the scene that it was trained on.
+        coarser: factor on TOLERANCE_C and TOLERANCE_UNIT: the coarser, the fewer moments are looked at.
 
     Raises:
         SceneError: the model's Gaussians cannot be told apart from it, or none can be seen.
@@ -129,7 +133,7 @@ def snapshot(module: Any) -> Snapshot:
             f"what {type(module.thermal).__name__} learned cannot be exported as Gaussians: {module.thermal.stays_here}. Render "
             "images of it (src/render.py), or train a method whose Gaussians stay as they are, such as method=3dgs"
         )
-    visible, thermal_range = _Visible(module), module.scene.thermal_range
+    visible, thermal_range = _Visible(module, coarser), module.scene.thermal_range
     left_out = [*visible.said_of_views, *visible.said_of_motion()]
     layers = visible.layers()
     background = module.background[0].item()
@@ -168,8 +172,8 @@ class _Effort:
 class _Visible:
     """The Gaussians of a module that can be seen, as rendered in the middle of the record, and what they send over time.
 
-    Quantities over time (``camera``, ``surface``, ``truth``, ``without``) are blended values [n] of all of them, or of those
-    with some numbers among them.
+    Quantities over time (``camera``, ``surface``, ``truth``, ``without``) are blended values [T, n] at some moments, of all of
+    them or of those with some numbers among them.
 
     Attributes:
         span: of time that is covered; None where nothing changes.
@@ -183,7 +187,7 @@ class _Visible:
         said_of_views: what a snapshot leaves out of that, in sentences.
     """
 
-    def __init__(self, module: Any) -> None:
+    def __init__(self, module: Any, coarser: float = 1.0) -> None:
         self.module, self.scene = module, module.scene
         train = self.scene.train
         self.span = span_of(self.scene)
@@ -204,7 +208,7 @@ class _Visible:
         self.channels = module.thermal.modality_channels[0]
         self.to_unit, self.unit = _scale(self.scene, module.modality)
         self.slope = self._slope()
-        self.tolerance = TOLERANCE_C if self.unit else TOLERANCE_UNIT
+        self.tolerance = coarser * (TOLERANCE_C if self.unit else TOLERANCE_UNIT)
         self.cameras, self.look, self.said_of_views = self._views()
 
     def _at(self, frame: Frame, time_s: float | None) -> Frame:
@@ -220,6 +224,10 @@ class _Visible:
     def _blended(self, values: Tensor) -> Tensor:
         """Blended values [n] of image values [n, C]."""
         return self.module.composite.encode(values, self.channels)[:, : self.channels].mean(1).nan_to_num()
+
+    def _blended_units(self, values: Tensor) -> Tensor:
+        """Blended values [T, n] of image values [T, n] of one channel."""
+        return self._blended(values.reshape(-1, 1)).reshape(values.shape)
 
     def _slope(self) -> float:
         values = torch.linspace(0, 1, TABLE, dtype=torch.float64)
@@ -263,41 +271,45 @@ class _Visible:
 
     # Quantities over time ------------------------------------------------------------------------------------------------
 
-    def camera(self, time_s: float | None, ids: Tensor | None = None) -> Tensor:
+    def camera(self, moments_s: Sequence[float | None], ids: Tensor | None = None) -> Tensor:
         """What they send to a camera."""
+        return torch.stack([self._sent(time_s, ids) for time_s in moments_s])
+
+    def _sent(self, time_s: float | None, ids: Tensor | None) -> Tensor:
+        """``camera`` at a moment, [n]."""
         return self._blended(torch.stack([self._emitted(frame, time_s, ids) for frame in self.cameras]).mean(0))
 
-    def without(self, part: str, time_s: float | None, ids: Tensor | None = None) -> Tensor:
+    def without(self, part: str, moments_s: Sequence[float | None], ids: Tensor | None = None) -> Tensor:
         """What they would send to a camera without a part of the model."""
         with self.module.thermal.without(part):
-            return self.camera(time_s, ids)
+            return self.camera(moments_s, ids)
 
-    def surface(self, time_s: float, ids: Tensor | None = None) -> Tensor:
+    def surface(self, moments_s: Sequence[float], ids: Tensor | None = None) -> Tensor:
         """The temperature of the surface, of models that tell one (``_tells_surface``)."""
         wanted = self.kept if ids is None else self.kept[ids]
-        temperature_k = self.module.thermal.temperature(self.module.splats, time_s, wanted)
+        temperatures_k = self.module.thermal.temperatures(self.module.splats, moments_s, wanted)
         lowest_k, span_k = kelvin(self.scene.thermal_range.min_c), self.scene.thermal_range.span_k
-        return self._blended(((temperature_k - lowest_k) / span_k)[:, None])
+        return self._blended_units((temperatures_k - lowest_k) / span_k)
 
     def _tells_surface(self) -> bool:
         if self.span is None or not self.unit:
             return False
         return self.module.thermal.temperature(self.module.splats, self.scene.record[0]) is not None
 
-    def truth(self, time_s: float, ids: Tensor | None = None) -> Tensor:
+    def truth(self, moments_s: Sequence[float], ids: Tensor | None = None) -> Tensor:
         """The true temperature at their places, of scenes that know it."""
         wanted = self._points if ids is None else self._points[ids]
-        celsius = self.scene.truth(wanted, torch.tensor([time_s], dtype=torch.float64))[:, :1]
-        return self._blended(self.scene.thermal_range.to_unit(celsius).float())
+        celsius = self.scene.truth(wanted, torch.tensor(moments_s, dtype=torch.float64)).T
+        return self._blended_units(self.scene.thermal_range.to_unit(celsius).float())
 
     def _alike(self, one: ValuesAt, other: ValuesAt) -> bool:
         """Whether two quantities are the same at some moments, to a tenth of the tolerance."""
         least = 0.1 * (self.tolerance / self.slope)
         if self.span is None:
-            return bool((one(None) - other(None)).abs().max() <= least)
+            return bool((one([None]) - other([None])).abs().max() <= least)
         start, end = self.span
         moments = (start + share * (end - start) for share in (0.0, 0.37, 0.5, 0.81, 1.0))
-        return all((one(moment) - other(moment)).abs().max() <= least for moment in moments)
+        return all((one([moment]) - other([moment])).abs().max() <= least for moment in moments)
 
     # Layers --------------------------------------------------------------------------------------------------------------
 
@@ -339,7 +351,7 @@ class _Visible:
     ) -> Layer:
         tolerance = self.tolerance / self.slope * coarser
         if self.span is None:
-            basis = constant_basis(values_at(None, None).cpu())
+            basis = constant_basis(values_at([None], None)[0].cpu())
         else:
             basis = time_basis(
                 values_at, len(self.kept), *self.span, tolerance, effort.times, effort.curves, effort.bends, clipped
@@ -388,7 +400,7 @@ def _scale(scene: SceneData, modality: str) -> tuple[float, str]:
 
 def _inside(values_at: ValuesAt) -> ValuesAt:
     """A quantity where the image can show it."""
-    return lambda time, ids=None: values_at(time, ids).clamp(0, 1)
+    return lambda moments, ids=None: values_at(moments, ids).clamp(0, 1)
 
 
 def _ends(layers: list[Layer], background: float) -> tuple[float, float]:

@@ -25,7 +25,7 @@ from torch import Tensor
 from heatsplat.kernels import marching as kernels
 from heatsplat.kernels.heat_balance import Balance
 from heatsplat.physics.energy_balance import Climate
-from heatsplat.physics.responses import driver_means, interval_of
+from heatsplat.physics.responses import driver_means
 from heatsplat.physics.surfaces import Surface
 from heatsplat.physics.units import DAY_S
 
@@ -283,16 +283,25 @@ class Course:
         core = None if self.surface.core is None else self.surface.core._replace(start=behind.pop(0))
         return self.surface._replace(start=start, core=core, film=behind[0] if behind else None)
 
-    def temperature(self, time_s: float, ids: Tensor | None = None) -> Tensor:
-        """Temperature x at a moment of the record, of all or of the surfaces ``ids``."""
-        times = self.climate.drivers.times_s
-        sample, _ = interval_of(times, time_s)
-        wanted, last = sample // self._every, len(self._states) - 1
-        if wanted > last:
-            moments = times[last * self._every :: self._every][1 : wanted - last + 1]
+    def temperatures(self, times_s: Sequence[float], ids: Tensor | None = None) -> Tensor:
+        """Temperatures x [T, n] at increasing moments of the record, of all or of the surfaces ``ids``."""
+        record = self.climate.drivers.times_s
+        moments = torch.tensor(times_s, dtype=torch.float64)
+        samples = torch.searchsorted(record, moments, right=True).clamp(1, len(record) - 1) - 1
+        wanted = samples // self._every
+        self._keep(int(wanted[-1]))
+        # A march passes all between its moments; where that is more than one state, it begins anew.
+        apart = (wanted.diff() > 1).nonzero()[:, 0] + 1
+        found = []
+        for some, states in zip(moments.tensor_split(apart), wanted.tensor_split(apart), strict=True):
+            state = int(states[0])
+            now = self._from(state) if ids is None else rows_of(self._from(state), ids)
+            found.append(march(self.climate, now, some, False, state * self._every)[:, :, 0])
+        return torch.cat(found)
+
+    def _keep(self, number: int) -> None:
+        """Marches as far as that state."""
+        last, times = len(self._states) - 1, self.climate.drivers.times_s
+        if number > last:
+            moments = times[last * self._every :: self._every][1 : number - last + 1]
             self._states += list(march(self.climate, self._from(last), moments, False, last * self._every))
-        now = self._from(wanted)
-        if ids is not None:
-            now = rows_of(now, ids)
-        moment = torch.tensor([time_s], dtype=torch.float64)
-        return march(self.climate, now, moment, False, wanted * self._every)[0, :, 0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -350,3 +350,8 @@ class ThermalModel(Heat):
     def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
         """Temperature at a time in kelvin of the Gaussians ``ids``, or of all, [n]; None where the model has no temperature."""
         return None
+
+    def temperatures(self, splats: Splats, times_s: Sequence[float], ids: Tensor | None = None) -> Tensor:
+        """``temperature`` at increasing times, [T, n], of a model that has one: a model that goes on from one time to the next
+        is quicker so."""
+        return torch.stack([self.temperature(splats, time_s, ids) for time_s in times_s])

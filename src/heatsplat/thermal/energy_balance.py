@@ -309,6 +309,13 @@ class EnergyBalance(ThermalModel):
     def temperature(self, splats: Splats, time_s: float, ids: Tensor | None = None) -> Tensor | None:
         return self._temperature(splats, Query(ids, time_s=time_s)) + self.reference_k.item()
 
+    def temperatures(self, splats: Splats, times_s: Sequence[float], ids: Tensor | None = None) -> Tensor:
+        if self.options.linear or torch.is_grad_enabled():
+            return super().temperatures(splats, times_s, ids)
+        for time_s in (times_s[0], times_s[-1]):
+            self._check_time(time_s)
+        return self._course_of(splats).temperatures(times_s, ids) + self.reference_k.item()
+
     def on_step(self, step: int) -> None:
         self._step = step
 
@@ -400,15 +407,9 @@ class EnergyBalance(ThermalModel):
 
     def _temperature(self, splats: Splats, query: Query) -> Tensor:
         """Temperature of the Gaussians in ``query.ids`` in kelvin above the reference, [n]."""
-        times = self.climate.drivers.times_s
-        first, last = float(times[0]), float(times[-1])
-        if not first <= query.time_s <= last:
-            raise SceneError(
-                f"there is no weather for second {query.time_s:.6g}: the record runs from {first:.6g} to {last:.6g} s "
-                "after the first training frame. Give a record that covers every moment that is asked for."
-            )
+        self._check_time(query.time_s)
         if not self.options.linear and not torch.is_grad_enabled():
-            return self._course_of(splats).temperature(query.time_s, query.ids)
+            return self._course_of(splats).temperatures([query.time_s], query.ids)[0]
         surface = self._surface(splats, query)
         if self.options.linear:
             return self.climate.linear_temperature(surface, query.time_s)
@@ -417,6 +418,15 @@ class EnergyBalance(ThermalModel):
         ids = torch.arange(len(splats), device=splats.means.device) if query.ids is None else query.ids
         given = [splats[name].detach() for name in GIVEN if name in splats]
         return self._kept.temperature(surface, query.time_s, ids, given, splats[MARCHED_AT].detach())
+
+    def _check_time(self, time_s: float) -> None:
+        times = self.climate.drivers.times_s
+        first, last = float(times[0]), float(times[-1])
+        if not first <= time_s <= last:
+            raise SceneError(
+                f"there is no weather for second {time_s:.6g}: the record runs from {first:.6g} to {last:.6g} s "
+                "after the first training frame. Give a record that covers every moment that is asked for."
+            )
 
     def _course_of(self, splats: Splats) -> Course:
         """The course of all Gaussians as they are now: that of the last view, unless something has changed since."""

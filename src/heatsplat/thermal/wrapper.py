@@ -123,6 +123,11 @@ class Wrapper(ThermalModel):
         """That of what is wrapped: what a camera would see without anything in between."""
         return self._models[0].temperature(splats, time_s, ids)
 
+    def temperatures(self, splats: Splats, times_s: Sequence[float], ids: Tensor | None = None) -> Tensor:
+        if type(self).temperature is not Wrapper.temperature:  # it changes that of what is wrapped, time by time
+            return super().temperatures(splats, times_s, ids)
+        return self._models[0].temperatures(splats, times_s, ids)
+
     @property
     def removable(self) -> tuple[str, ...]:
         """Those of what is wrapped."""
