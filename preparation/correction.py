@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import torch
 from rich.progress import track
 from torch import Tensor
 
-from heatsplat.contracts import Camera, SceneData, SceneError, View, ViewSet, check_numbers, quantile
+from heatsplat.contracts import Camera, Frame, SceneData, SceneError, View, ViewSet, check_numbers, quantile
 from heatsplat.datamodules.colmap import FRAMES_FILE
 from heatsplat.datamodules.file_names import stem_of
 from heatsplat.datamodules.formats.colmap import pinholes, write_model
@@ -187,6 +188,7 @@ def correct(
         metres_per_unit or scale_of(trained.scene),
         boxes,
         InputUncertainty(**(uncertainty or {})),
+        trained.module.cameras.of,
     )
 
 
@@ -206,12 +208,16 @@ def correct_scene(
     metres_per_unit: float | None,
     boxes: Sequence[Region] = (),
     uncertain: InputUncertainty | None = None,
+    camera_of: Callable[[Frame], Camera] = attrgetter("camera"),
 ) -> Path:
-    """As ``correct``, of a scene whose depth [H, W] in a frame ``depth_of`` gives; ``folders`` may hold its preparation."""
+    """As ``correct``, of a scene whose depth [H, W] in a frame ``depth_of`` gives; ``folders`` may hold its preparation.
+
+    Cameras are those that ``camera_of`` a frame gives, such as a run has learned them (``cameras=refined``).
+    """
     _check(scene, folders, target, index, metres_per_unit)
     place = Target(target, CORRECTED)
     place.claim()
-    views = _by_name(scene)
+    views = _by_name(scene, camera_of)
     few = [(frame.camera, depth_of(frame)) for frame in views.frames[:: max(1, len(views) // 8)]]
     far = typical_distance(few) * metres_per_unit
     doubts = [_doubt(few, scene.points), _beyond(few, scene.points)]
@@ -241,6 +247,7 @@ def correct_scene(
         file = f"{Path(view.frame.name).with_suffix('').as_posix()}.tiff"
         write_temperature(target / "images" / file, image.celsius.float().numpy())
         outcome.add(file, view.camera, image, wanted, air_assumed=given.air_c is None and done.distance_m == 0)
+        outcome.cut_off += _cut_off(view)
         if regions is not None:
             guessed = given.reflected_c is None and done.emissivity == 1
             regions.add(view.camera, image.parts, image.alike, image.celsius, image.known, guessed)
@@ -265,6 +272,11 @@ def correct_scene(
             f"{outcome.lost:,} pixels{' outside of all regions' if boxes else ''} have no temperature under these conditions, "
             "and are left out (NaN): they would reflect more than was measured of them, or lie farther than the formula of "
             "the air reaches."
+        )
+    if outcome.cut_off:
+        late.append(
+            f"{outcome.cut_off:,} pixels were cut off at an end of the span that the camera had chosen for their image: what was "
+            "recorded is a bound of their temperature, which cannot be corrected, and they are left out (NaN)."
         )
     sections = [_section(outcome, far, index, [*doubts, *late], bool(boxes))]
     if regions is not None:
@@ -310,9 +322,16 @@ def _check(
 
 
 def _celsius(scene: SceneData, view: View) -> Tensor:
-    """Temperatures [H, W] float64 in °C that a view was trained on, NaN where a pixel does not count."""
+    """Temperatures [H, W] float64 in °C that a view was trained on, NaN where a pixel does not count or is only a bound."""
     celsius = scene.thermal_range.to_celsius(view.thermal[..., 0].double())
-    return celsius if view.mask is None else celsius.where(view.mask, torch.nan)
+    return celsius if view.known is None else celsius.where(view.known, torch.nan)
+
+
+def _cut_off(view: View) -> int:
+    """How many pixels that count are mere bounds of a temperature."""
+    if view.ends is None:
+        return 0
+    return int(((view.ends != 0) if view.mask is None else (view.ends != 0) & view.mask).sum())
 
 
 class Spread:
@@ -363,6 +382,7 @@ class Outcome:
         conditions: those that the last image was corrected for.
         air_assumed: whether nothing says of the air of some image what it was.
         lost: pixels of all images, but for those in regions, that have a temperature no more.
+        cut_off: pixels of all images that never had one, but a bound of it.
         shown: the image that the report shows.
     """
 
@@ -375,6 +395,7 @@ class Outcome:
     conditions: Conditions = Conditions()
     air_assumed: bool = False
     lost: int = 0
+    cut_off: int = 0
     shown: Corrected | None = None
 
     def add(self, file: str, camera: Camera, image: Corrected, conditions: Conditions, air_assumed: bool) -> None:
@@ -393,11 +414,13 @@ class Outcome:
         self.lost += int((lost if image.parts is None else lost & (image.parts.number < 0)).sum())
 
 
-def _by_name(scene: SceneData) -> ViewSet:
-    """All views of a scene, each decoded when it is asked for: together they may be more than memory holds."""
+def _by_name(scene: SceneData, camera_of: Callable[[Frame], Camera]) -> ViewSet:
+    """All views of a scene from these cameras, each decoded when it is asked for: together they may be more than memory holds."""
     places = [(part, k) for part in (scene.train, scene.test) for k in range(len(part))]
     places.sort(key=lambda place: place[0].frames[place[1]].name)
-    return ViewSet([part.frames[k] for part, k in places], lambda i: places[i][0][places[i][1]])
+    with torch.no_grad():
+        frames = [replace(part.frames[k], camera=camera_of(part.frames[k])) for part, k in places]
+    return ViewSet(frames, lambda i: replace(places[i][0][places[i][1]], frame=frames[i]))
 
 
 def _doubt(few: Sequence[tuple[Camera, Tensor]], points: Tensor) -> str:

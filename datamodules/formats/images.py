@@ -19,6 +19,7 @@ from PIL.TiffImagePlugin import IMAGEDESCRIPTION, ImageFileDirectory_v2
 
 from heatsplat.contracts import SceneError
 from heatsplat.datamodules.formats.lens import Lens, undistortion_maps
+from heatsplat.geometry.resampling import CUT_SHARE
 
 # What is wrong with a file is said by the exceptions below; OpenCV would add lines of its own, even for unknown TIFF tags.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -367,6 +368,7 @@ def resized_ends(ends: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def _touched(ends: np.ndarray, resample: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Which new pixels rest on pixels at an end of the image's span (1: warm, -1: cold), if on none at the other end."""
-    above, below = (resample((ends == sign).astype(np.float32)) > 1e-3 for sign in (1, -1))
+    """Which new pixels rest on pixels at an end of the image's span (1: warm, -1: cold), if on none at the other end: the rule of
+    ``geometry.resampling.ends_on``."""
+    above, below = (resample((ends == sign).astype(np.float32)) > CUT_SHARE for sign in (1, -1))
     return above.astype(np.int8) - below.astype(np.int8)

@@ -5,6 +5,7 @@ import unicodedata
 import cv2
 import numpy as np
 import pytest
+import torch
 from layouts import write_image
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
@@ -18,11 +19,13 @@ from heatsplat.datamodules.formats.images import (
     read_grey,
     read_image,
     resized,
+    resized_ends,
     resized_mask,
     split_alpha,
     tiff_text,
     to_grey,
 )
+from heatsplat.geometry.resampling import ends_on
 
 
 @pytest.mark.parametrize("big", [False, True])
@@ -247,3 +250,16 @@ def test_files_whose_names_are_not_utf8_are_read(tmp_path):
         for found in (read_image(path), read_image(path, 0), read_grey(path)):
             assert np.array_equal(found, pixels)
     assert read_grey(tmp_path / "none.png") is None
+
+
+@pytest.mark.parametrize("size", [(32, 24), (13, 9), (7, 5)])
+def test_where_an_image_was_cut_off_is_the_same_however_it_is_resized(size):
+    """By the data module when it reads it, and by training on smaller ones."""
+    width, height = size
+    draws = np.random.default_rng(0)
+    for share in (0.001, 0.02, 0.5):
+        ends = np.where(draws.random((48, 64)) < share, draws.choice([-1, 1], (48, 64)), 0).astype(np.int8)
+        read = resized_ends(ends, width, height)
+        trained = ends_on(torch.from_numpy(ends), height, width).numpy()
+        np.testing.assert_array_equal(read, trained)
+        assert share > 0.02 or read.any()

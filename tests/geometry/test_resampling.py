@@ -126,6 +126,9 @@ def test_a_coarse_pixel_was_cut_off_where_one_below_it_was():
     ends[0, 0], ends[1, 2], ends[2, 4], ends[3, 5] = 1, -1, 1, -1
     assert ends_on(ends, 2, 3).tolist() == [[1, -1, 0], [0, 0, 0]]  # the last has both
     assert ends_on(ends, 4, 6) is ends and ends_on(None, 2, 3) is None
+    barely = torch.zeros(64, 64, dtype=torch.int8)
+    barely[0, 0] = 1
+    assert ends_on(barely, 1, 1).tolist() == [[0]] and ends_on(barely[:32, :31], 1, 1).tolist() == [[1]]
     assert torch.equal(ends_on(ends, 8, 12), ends.repeat_interleave(2, 0).repeat_interleave(2, 1))
 
 

@@ -307,9 +307,12 @@ def test_what_cannot_be_corrected_is_refused_with_the_remedy(tmp_path, change, s
 def test_positions_tell_the_scale_where_the_scene_does_not(monkeypatch, own, scale):
     monkeypatch.setattr(correction, "placed", lambda scene: SimpleNamespace(scale=3.0))
     floor = SimpleNamespace(metres_per_unit=own, name="floor", positions="frames.csv")
-    trained = SimpleNamespace(config={"data": {"root": None}}, scene=floor, depth=None)
+    module = SimpleNamespace(cameras=SimpleNamespace(of="cameras of the run"))
+    trained = SimpleNamespace(config={"data": {"root": None}}, scene=floor, depth=None, module=module)
     monkeypatch.setattr(correction, "load", lambda ckpt, **given: trained)
-    monkeypatch.setattr(correction, "correct_scene", lambda *given: given[7])
+    monkeypatch.setattr(
+        correction, "correct_scene", lambda *given: given[7] if given[-1] == module.cameras.of else None
+    )
     settings = {"conditions": {}, "band_um": (8, 14), "refractive_index": None}
     assert correction.correct("a.ckpt", None, metres_per_unit=None, **settings) == scale
     assert correction.correct("a.ckpt", None, metres_per_unit=7.0, **settings) == 7.0
@@ -321,13 +324,49 @@ def test_the_working_folder_is_no_preparation_of_a_scene_without_a_folder(tmp_pa
     monkeypatch.chdir(tmp_path)
     floor = SimpleNamespace(metres_per_unit=1.0, name="floor")
     given = {"root": None, "scene": "floor"}
-    trained = SimpleNamespace(config={"data": given}, scene=floor, depth=None)
+    module = SimpleNamespace(cameras=SimpleNamespace(of=None))
+    trained = SimpleNamespace(config={"data": given}, scene=floor, depth=None, module=module)
     monkeypatch.setattr(correction, "load", lambda ckpt, **_: trained)
     monkeypatch.setattr(correction, "correct_scene", lambda *given: given[2])
     settings = {"conditions": {}, "band_um": (8, 14), "refractive_index": None, "metres_per_unit": None}
     assert correction.correct("a.ckpt", tmp_path / "corrected", **settings) == []
     given["root"] = "data"
     assert correction.correct("a.ckpt", tmp_path / "corrected", **settings) == [Path("data"), Path("data/floor")]
+
+
+def test_cameras_are_those_that_the_run_learned(tmp_path):
+    def moved(frame):
+        pose = frame.camera.viewmat.clone()
+        pose[0, 3] += torch.nn.Parameter(torch.tensor(0.5 + frame.frame_id))  # as what is learned
+        return replace(frame.camera, viewmat=pose)
+
+    asked = []
+
+    def depth_of(frame):
+        asked.append(float(frame.camera.viewmat[0, 3].numpy()))
+        return DEPTH
+
+    given = GivenConditions(), BandResponse(), None, METRES
+    correct_scene(scene(), depth_of, [], tmp_path / "new", *given, camera_of=moved)
+    assert set(asked) == {0.5, 1.5, 2.5}
+    module = Colmap(root=str(tmp_path / "new"))
+    module.setup()
+    frames = [*module.scene.train.frames, *module.scene.test.frames]
+    shifts = [(frame.camera.viewmat[:3, 3] - frame.camera.viewmat[:3, :3] @ module.scene.origin)[0] for frame in frames]
+    assert sorted(float(shift) for shift in shifts) == pytest.approx([0.5, 1.5, 2.5], abs=1e-5)
+
+
+def test_pixels_that_were_cut_off_are_left_out_and_counted(tmp_path, caplog):
+    floor = scene()
+    ends = torch.zeros(32, 40, dtype=torch.int8)
+    ends[20:22, 5:9], ends[30, 0] = 1, -1
+    train = floor.train
+    floor.train = ViewSet(train.frames, lambda i: replace(train[i], ends=ends if i == 1 else None))
+    page = correct_scene(floor, lambda _: DEPTH, [], tmp_path / "new", GivenConditions(), BandResponse(), None, METRES)
+    first, second = (read_temperature(tmp_path / "new" / "images" / f"{i}.tiff") for i in (0, 1))
+    assert np.isfinite(first).all()
+    np.testing.assert_array_equal(np.isnan(second), ends.numpy() != 0)
+    assert "9 pixels were cut off" in caplog.text and "9 pixels were cut off" in page.read_text()
 
 
 def test_the_scene_itself_is_no_target(tmp_path):

@@ -10,7 +10,7 @@ import torch
 from running import TINY
 
 from heatsplat.composition import build, compose
-from heatsplat.contracts import SceneError
+from heatsplat.contracts import SceneError, ViewSet
 from heatsplat.geometry.neighbours import neighbour_distances
 from heatsplat.geometry.rotations import quats_to_matrices
 from heatsplat.geometry.spherical_harmonics import C0
@@ -18,7 +18,7 @@ from heatsplat.io.ply import read_splats, write_splats
 from heatsplat.thermal.base import PerGaussian
 from heatsplat.thermal.composed import Composed
 from heatsplat.thermal.static import Static
-from heatsplat.training.init import Initialisation, Pretrained, Voxels
+from heatsplat.training.init import Initialisation, Pretrained, Voxels, looks_at
 
 
 class Faint(Static):
@@ -37,6 +37,31 @@ def test_a_gaussian_is_as_large_as_the_distance_to_its_neighbours(parts):
     splats, _ = Initialisation(scale=0.5)(scene, thermal, seed=0)
     size = neighbour_distances(scene.points.float()).square().mean(1).sqrt()
     assert torch.allclose(splats.scales.detach(), 0.5 * size[:, None].expand(-1, 3), rtol=1e-5)
+
+
+def test_what_is_known_of_a_point_counts_and_not_what_only_bounds_it(parts):
+    """Images that are cut off at 0.5 where they are warmer, as of a camera that chooses its span: every second one, or all."""
+    scene, _ = parts
+
+    def looks(every):
+        def decode(i):
+            view = scene.train[i]
+            if i % every:
+                return view
+            warm = view.thermal[..., 0] > 0.5
+            return replace(view, thermal=view.thermal.clamp(max=0.5), ends=warm.to(torch.int8))
+
+        return looks_at(replace(scene, train=ViewSet(scene.train.frames, decode)), scene.points, "thermal", 1)[..., 0]
+
+    whole = looks_at(scene, scene.points, "thermal", 1)[..., 0]
+    half, none = looks(2), looks(1)
+    always_warm = ((whole > 0.5) | whole.isnan()).all(1) & ~whole.isnan().all(1)
+    assert always_warm.sum() > 20
+    assert (none[always_warm].nanmedian(1).values == 0.5).all()
+    seen_by_both = always_warm & ~whole[:, 1::2].isnan().all(1) & ~whole[:, ::2].isnan().all(1)
+    left = half[seen_by_both]
+    assert seen_by_both.any() and (left[~left.isnan()] > 0.5).all()
+    assert left.isnan().sum() > whole[seen_by_both].isnan().sum()
 
 
 def test_gaussians_of_a_small_world_are_as_large_in_it_as_in_any_other(parts):

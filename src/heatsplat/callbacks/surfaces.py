@@ -126,10 +126,10 @@ def middle(scene: SceneData, frame: Frame) -> Frame:
 def look(module: pl.LightningModule, frame: Frame, mask: Tensor | None = None) -> Look:
     """What the model shows in a frame, without what its camera adds, °C: from the camera as it is given, not as the run learned
     it, for ``Look`` finds places by that camera's rays. NaN where a mask [H, W] is False: no image told what is there."""
-    output = module.render(frame, depth=True, camera=frame.camera)
+    output = module.render(frame, camera=frame.camera)
     values = module.scene.thermal_range.to_celsius(output.features[..., 0].clamp(0, 1))
     values = values.cpu() if mask is None else values.cpu().where(mask, torch.nan)
-    return Look(frame.camera, surface_depth(output.depth, output.alpha[0]).cpu(), values)
+    return Look(frame.camera, module.surface(frame), values)
 
 
 def picture(

@@ -36,6 +36,8 @@ def _stretched(kernel: Callable[[Tensor], Tensor]) -> Callable[[Tensor, float], 
     return lambda distances, step: kernel(distances / max(step, 1.0))
 
 
+CUT_SHARE = 1e-3  # of a new pixel that may lie in pixels which were cut off, and it still counts as measured
+
 # Weights of old pixels of width 1 at these distances from the centre of a new one, and its width.
 KERNELS: dict[str, Callable[[Tensor, float], Tensor]] = {
     "area": _overlap,
@@ -104,15 +106,17 @@ def weights(count: int, new_count: int, kernel: str) -> Tensor:
 
 
 def ends_on(ends: Tensor | None, height: int, width: int) -> Tensor | None:
-    """Where an image on ``height`` x ``width`` pixels was cut off, [height, width] int8, None stays: a pixel is that covers one
-    which was, if none of them was at the other end.
+    """Where an image on ``height`` x ``width`` pixels was cut off, [height, width] int8, None stays: a pixel of which more than
+    ``CUT_SHARE`` was, at one end alone.
 
     Args:
         ends: [H, W] of the image (``View.ends``).
     """
     if ends is None or ends.shape == (height, width):
         return ends
-    above, below = (resampled((ends == sign)[..., None].float(), height, width, "area")[..., 0] > 0 for sign in (1, -1))
+    above, below = (
+        resampled((ends == sign)[..., None].float(), height, width, "area")[..., 0] > CUT_SHARE for sign in (1, -1)
+    )
     return above.to(torch.int8) - below.to(torch.int8)
 
 

@@ -46,6 +46,7 @@ class HistogramAlignment(PerFrame):
         found = {}
         for view in scene.train:
             values = view.image(modality)
+            # Pixels that were cut off at an end of their span keep their place among the others.
             values = values if view.mask is None else values[view.mask]
             unknown = not values.numel()  # its mask leaves none: the shared histogram stands for its own
             found[view.frame.frame_id] = shares * torch.nan if unknown else quantile(values.flatten().float(), shares)

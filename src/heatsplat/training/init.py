@@ -396,9 +396,11 @@ def _geometry_of_checkpoint(path: Path, scene: SceneData, thermal: ThermalModel)
 
 def looks_at(scene: SceneData, points: Tensor, modality: str, channels: int) -> Tensor:
     """Image values at the projections of points in ``SAMPLED_VIEWS`` training views, [P, F, channels] in [0, 1], NaN where a
-    view does not see one. No test for occlusion."""
+    view does not see one. No test for occlusion. What is a mere bound of a temperature counts at points of which no view knows
+    more."""
     positions = evenly_spread(len(scene.train), SAMPLED_VIEWS)
     samples = torch.full((len(positions), len(points), channels), float("nan"))
+    bound = torch.zeros(len(positions), len(points), dtype=torch.bool)
     for row, position in enumerate(positions):
         view = scene.train[position]
         image, camera = view.image(modality), view.camera
@@ -410,6 +412,10 @@ def looks_at(scene: SceneData, points: Tensor, modality: str, channels: int) -> 
             ids, at_line, at_column = ids[valid], at_line[valid], at_column[valid]
         values = image[at_line, at_column]
         samples[row, ids] = values if values.shape[1] == channels else values.mean(1, keepdim=True).expand(-1, channels)
+        if modality == "thermal" and view.ends is not None:
+            bound[row, ids] = view.ends[at_line, at_column] != 0
+    known = (~bound & ~samples.isnan().any(2)).any(0)
+    samples[bound & known] = torch.nan
     return samples.transpose(0, 1)
 
 
