@@ -41,7 +41,9 @@ class Looking(LiveServer):
     def __init__(self, *arguments):
         super().__init__(*arguments)
         Looking.seen = []
+        self.looked = threading.Event()
         threading.Thread(target=self.look, daemon=True).start()
+        assert self.looked.wait(30)  # a short run on a busy machine may end before
 
     def look(self):
         try:
@@ -51,6 +53,7 @@ class Looking(LiveServer):
                     for path in ("status", "")
                 )
                 Looking.seen.append((json.loads(status), page))
+                self.looked.set()
                 time.sleep(0.02)
         except OSError:  # it was closed
             return

@@ -11,6 +11,7 @@ from heatsplat.geometry.coverage import surface_depth
 from heatsplat.renderers.settings import Renderer
 
 WALL = 4.0
+RENDERER = Renderer(backend="cpu")
 
 
 @pytest.fixture
@@ -20,24 +21,26 @@ def camera() -> Camera:
 
 
 def layers(*opacity_at: tuple[float, float]):
-    """What shows layers of Gaussians across the image, each with an opacity and a depth, and their centres."""
+    """Layers of Gaussians across the image, each with an opacity and a depth."""
     x, y = torch.meshgrid(torch.linspace(-1, 1, 41), torch.linspace(-1, 1, 41), indexing="xy")
     plane = torch.stack([x, y, torch.ones_like(x)], dim=-1).reshape(-1, 3)
     means = torch.cat([z * plane for _, z in opacity_at])
     scales = torch.cat([torch.full_like(plane, 0.05 * z) for _, z in opacity_at])
     opacities = torch.cat([torch.full((len(plane),), opacity) for opacity, _ in opacity_at])
     quats = torch.tensor([1.0, 0, 0, 0]).expand(len(means), 4)
-    shapes = means, quats, scales * torch.tensor([1.0, 1.0, 0.05]), opacities[None]
-    return partial(Renderer(backend="cpu").values_seen, shapes), means
+    return means, quats, scales * torch.tensor([1.0, 1.0, 0.05]), opacities[None]
+
+
+def found(shapes, camera, mask=None):
+    return closest_depth(partial(RENDERER.depths_at_shares, shapes, camera), mask)
 
 
 def test_fog_before_a_wall_and_clutter_behind_it_do_not_move_it(camera):
     fog = [(0.02, z) for z in (1.0, 1.5, 2.0, 2.5, 3.0)]
     clutter = [(0.5, z) for z in (8.0, 12.0, 20.0)]
-    show, means = layers(*fog, (0.3, WALL), *clutter)
-    seen = partial(show, camera=camera)
-    depth, spread = closest_depth(seen, means, camera)
-    output = seen(values=torch.zeros(len(means), 1), depth=True)
+    shapes = layers(*fog, (0.3, WALL), *clutter)
+    depth, spread = found(shapes, camera)
+    output = RENDERER.values_seen(shapes, torch.zeros(len(shapes[0]), 1), camera, depth=True)
     mean = surface_depth(output.depth, output.alpha[0])
     inner = (slice(6, -6), slice(6, -6))
     assert (depth - WALL).abs()[inner].max() < 0.06 * WALL and spread[inner].max() < 0.2 * WALL
@@ -48,18 +51,15 @@ def test_a_surface_before_all_mean_depths_is_found_where_its_gaussians_lie(camer
     """As the ground below a drone, with much of a pixel's opacity far behind it: any stretch within half a unit of 74."""
     thin = [(0.03, 73.5 + 0.05 * i) for i in range(21)]
     far = (0.1, 110.0), (0.1, 130.0), (0.1, 160.0), (0.2, 300.0), (0.5, 900.0)
-    show, means = layers(*thin, *far)
-    depth, spread = closest_depth(partial(show, camera=camera), means, camera)
+    depth, spread = found(layers(*thin, *far), camera)
     inner = (slice(6, -6), slice(6, -6))
     assert (depth - 74.0).abs()[inner].median() < 0.55 and spread[inner].median() < 0.3
 
 
 def test_a_mask_and_open_pixels_are_infinite(camera):
-    show, means = layers((0.5, WALL))
     mask = torch.ones(24, 32, dtype=torch.bool)
     mask[:, :10] = False
-    depth, spread = closest_depth(partial(show, camera=camera), means, camera, mask)
+    depth, spread = found(layers((0.5, WALL)), camera, mask)
     assert depth[:, :10].isinf().all() and spread[:, :10].isinf().all() and depth[:, 10:].isfinite().all()
-    show, means = layers((0.01, WALL))
-    depth, spread = closest_depth(partial(show, camera=camera), means, camera)
+    depth, spread = found(layers((0.01, WALL)), camera)
     assert depth.isinf().all() and spread.isinf().all()

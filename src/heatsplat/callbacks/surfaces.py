@@ -16,7 +16,7 @@ from torch import Tensor
 from heatsplat.callbacks.images import scene_bounds
 from heatsplat.contracts import Frame, SceneData, SceneError, check_count, evenly_spread
 from heatsplat.export.place import Place, placed, unit_in_metres
-from heatsplat.geometry.coverage import DEPTH_TOLERANCE, surface_depth
+from heatsplat.geometry.coverage import DEPTH_TOLERANCE
 from heatsplat.geometry.extremes import Surface, extremes
 from heatsplat.geometry.looks import Look
 from heatsplat.geometry.projection import to_camera, to_pixels

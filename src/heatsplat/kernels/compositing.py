@@ -268,6 +268,88 @@ def composite(
 
 
 @inline
+def _reached_in_tile(
+    layout, tile, tiles_x, records, instances, begin, end, centres, transmittances, shares, worker, state, numbers, depths
+):  # fmt: skip
+    """Fills ``depths`` at the pixels of a tile. Rows of a block's state: transmittance, final opacity, the awaited one."""
+    for block in range(BLOCKS):
+        here, opacity = worker * BLOCKS + block, 1.0 - load_vector(transmittances, tile * BLOCKS + block)
+        store_vector(state, 3 * here, splat(1.0))
+        store_vector(state, 3 * here + 1, opacity)
+        store_vector(state, 3 * here + 2, opacity * shares[0])
+        for lane in range(LANES):
+            numbers[here, lane] = 0
+    for instance in range(begin, end):
+        prefetch(records, (instances[min(instance + AHEAD, end - 1), 0] & 0xFFFFFFFF) * records.shape[1])
+        rank, blocks = instances[instance, 0] & 0xFFFFFFFF, instances[instance, 1]
+        corner = _corner(records, rank, tile, tiles_x)
+        while blocks != 0:
+            block = lowest_bit(blocks)
+            blocks &= blocks - 1
+            here = worker * BLOCKS + block
+            u1, u2 = _whitened(records, rank, corner, centres, block)
+            density, passed = _density(records, rank, u1, u2)
+            _, _, after, _ = _take(density, passed, load_vector(state, 3 * here))
+            store_vector(state, 3 * here, after)
+            reached = bits(1.0 - absolute(after) >= load_vector(state, 3 * here + 2))
+            while reached != 0:
+                lane = lowest_bit(reached)
+                reached &= reached - 1
+                x = tile % tiles_x * TILE + block % TILE_BLOCKS * BLOCK + lane % BLOCK
+                y = tile // tiles_x * TILE + block // TILE_BLOCKS * BLOCK + lane // BLOCK
+                opacity = np.float32(1.0) - abs(load_scalar(state, 3 * here * LANES + lane))
+                whole, number = load_scalar(state, (3 * here + 1) * LANES + lane), numbers[here, lane]
+                awaited = np.float32(2.0)  # never reached
+                while number < shares.shape[0]:
+                    awaited = whole * shares[number]
+                    if opacity < awaited:
+                        break
+                    if x < depths.shape[1] and y < depths.shape[0]:
+                        depths[y, x, number] = records[rank, feature_column(layout)]
+                    awaited = np.float32(2.0)
+                    number += 1
+                numbers[here, lane] = number
+                store_scalar(state, (3 * here + 2) * LANES + lane, awaited)
+
+
+@inline
+def _reached_in_tiles(
+    worker, layout, records, instances, tile_starts, tile_ends, centres, transmittances, shares, ticket,
+    state, numbers, depths,
+):  # fmt: skip
+    """``depths_at_shares`` in tiles, as long as there are any."""
+    tiles_x = (depths.shape[1] + TILE - 1) // TILE
+    tile = take(ticket, 1)
+    while tile < tile_ends.shape[0]:
+        _reached_in_tile(
+            layout, tile, tiles_x, records, instances, tile_starts[tile], tile_ends[tile], centres, transmittances,
+            shares, worker, state, numbers, depths,
+        )  # fmt: skip
+        tile = take(ticket, 1)
+
+
+@kernel
+def depths_at_shares(
+    layout, workers, records, instances, tile_starts, tile_ends, centres, transmittances, shares, ticket,
+    state, numbers, depths,
+):  # fmt: skip
+    """Depths of the Gaussians with which pixels reach shares of the opacity that they end with.
+
+    Args:
+        layout: one channel, which is depth, of one modality.
+        records ... transmittances: as ``composite`` left them.
+        shares: [S] float32, increasing, above 0 and below 1.
+        ticket: [1] int64, zero.
+        state, numbers: scratch [workers * BLOCKS, 3, LANES] and [workers * BLOCKS, LANES] int64.
+        depths: out [H, W, S]; pixels without any opacity are left or have any depth.
+    """
+    parallel_for(
+        _reached_in_tiles, workers,
+        (layout, records, instances, tile_starts, tile_ends, centres, transmittances, shares, ticket, state, numbers, depths),
+    )  # fmt: skip
+
+
+@inline
 def _read_block(source, offset, step, row, wide, high, target, place):
     """Copies the pixels of a block into a vector, as ``_write_block`` does the other way."""
     for y in range(high):

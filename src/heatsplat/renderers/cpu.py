@@ -6,6 +6,7 @@ composite_backward, project_backward. What they pass to each other lies in buffe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -53,6 +54,25 @@ def render(inputs: RenderInputs) -> RenderOutput:
     )  # fmt: skip
     meta = {"means2d": frame.means2d, "radii": frame.radii, "visible_ids": ids}
     return RenderOutput(image, alpha, depth, meta, None if sums is None else WeightedSums(maps, sums))
+
+
+def depths_at_shares(inputs: RenderInputs, shares: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """Alpha [H, W], and camera z [H, W, S] of the Gaussians with which pixels reach ``shares`` of it, front to back. Pixels
+    without opacity have any.
+
+    Args:
+        inputs: with depth, of one modality without features ([N, 0]).
+        shares: [S] increasing, above 0 and below 1.
+
+    Raises:
+        ValueError: as of ``render``.
+    """
+    for name in ("means", "quats", "scales", "opacities", "features"):
+        _check(name, getattr(inputs, name))
+    frame = _Frame(inputs)
+    frame.bin((0,), frame.project(), inputs.features)
+    _, alpha, _ = frame.composite(inputs.features.new_zeros(0))
+    return alpha[0], frame.depths_at_shares(shares)
 
 
 def _check(name: str, tensor: Tensor) -> None:
@@ -173,6 +193,17 @@ class _Frame:
             image.numpy(), alpha.numpy(), _UNWANTED if depth is None else depth.numpy(),
         )  # fmt: skip
         return image, alpha, depth
+
+    def depths_at_shares(self, shares: Sequence[float]) -> Tensor:
+        """Depths [H, W, S] at which composited pixels reach shares of their opacity."""
+        array, rows = self.buffers.array, self.workers * BLOCKS
+        depths = torch.full((self.inputs.height, self.inputs.width, len(shares)), torch.inf)
+        compositing.depths_at_shares(
+            self.layout, self.workers, self.records, self.instances, self.tile_starts, self.tile_ends, _CENTRES,
+            self.transmittances, np.array(shares, np.float32), np.zeros(1, np.int64),
+            array("state", np.float32, rows, 3, LANES), array("numbers", np.int64, rows, LANES), depths.numpy(),
+        )  # fmt: skip
+        return depths
 
     def composite_backward(
         self, v_image: Tensor, v_alpha: Tensor, v_depth: Tensor | None, maps: Tensor | None

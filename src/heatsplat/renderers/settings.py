@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -10,7 +11,8 @@ import torch
 from torch import Tensor
 
 from heatsplat.contracts import Camera, RenderOutput, SceneData, check_option, is_number
-from heatsplat.renderers.base import BACKENDS, EPS2D, rasterization
+from heatsplat.renderers import cpu
+from heatsplat.renderers.base import BACKENDS, EPS2D, RenderInputs, rasterization
 from heatsplat.splats import ANCHORS, GAUSSIANS
 
 NEAR, FAR = 0.01, 1e10  # visible range of camera z in world units, unless a run sets another
@@ -100,9 +102,7 @@ class Renderer:
                 would make up for it. Where opacity is compensated, a coarse pixel also averages over the r² of full size
                 in it, whose variance is (1 - 1 / r²) / 12 of its own size.
         """
-        blur = self.eps2d / ratio**2
-        if self.antialiased:
-            blur += (1 - 1 / ratio**2) / 12
+        blur = self._blur(ratio)
         given = means.dtype
         dtype = given if self.backend == "reference" else torch.float32
 
@@ -136,6 +136,11 @@ class Renderer:
             return seen
         return replace(seen, features=seen.features.to(given), alpha=seen.alpha.to(given))
 
+    def _blur(self, ratio: float) -> float:
+        """Pixels² that are added to variances on the screen."""
+        blur = self.eps2d / ratio**2
+        return blur + (1 - 1 / ratio**2) / 12 if self.antialiased else blur
+
     def values_seen(
         self,
         shapes: tuple[Tensor, Tensor, Tensor, Tensor],
@@ -151,3 +156,20 @@ class Renderer:
             depth, ratio: as for the renderer itself.
         """
         return self(*shapes, values, camera, None, (values.shape[1],), depth=depth, ratio=ratio)
+
+    def depths_at_shares(
+        self, shapes: tuple[Tensor, Tensor, Tensor, Tensor], camera: Camera, shares: Sequence[float], ratio: float = 1.0
+    ) -> tuple[Tensor, Tensor]:
+        """Alpha [H, W] that ``camera`` sees, and camera z [H, W, S] of the Gaussians with which pixels reach these shares of it,
+        front to back; pixels without opacity have any. On the CPU, whatever renders images, without gradients.
+
+        Args:
+            shapes, ratio: as for ``values_seen``.
+            shares: [S] increasing, above 0 and below 1.
+        """
+        means, quats, scales, opacities = (tensor.detach().to("cpu", torch.float32) for tensor in shapes)
+        inputs = RenderInputs(
+            means, quats, scales, opacities, means[:, :0], camera.viewmat.to(means), camera.K.to(means), camera.width,
+            camera.height, self.near, self.far, None, self.antialiased, (0,), absgrad=False, depth=True, eps2d=self._blur(ratio),
+        )  # fmt: skip
+        return cpu.depths_at_shares(inputs, shares)

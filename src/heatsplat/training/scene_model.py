@@ -185,14 +185,13 @@ class SceneModel(pl.LightningModule):
     def surface(self, frame: Frame) -> Tensor:
         """Camera z [H, W] of the surface in a frame, in world units, on the CPU; infinite where there is none.
 
-        Where opacity is spread before or behind a surface it is nearer to the truth than ``depth``, and costs some 33 renders
-        (``geometry.closest_depth``). Of fields it is ``depth``.
+        Where opacity is spread before or behind a surface it is nearer to the truth than ``depth`` (``geometry.closest_depth``).
+        Of fields it is ``depth``.
         """
         if self.thermal.rows == NOTHING:
             return self.depth(frame)
         *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
-        seen = partial(self.renderer.values_seen, (*shape, opacities[:1]), camera=frame.camera)
-        return closest_depth(seen, shape[0], frame.camera)[0]
+        return closest_depth(partial(self.renderer.depths_at_shares, (*shape, opacities[:1]), frame.camera))[0]
 
     @contextmanager
     def showing(self, splats: Splats) -> Iterator[None]:

@@ -238,8 +238,7 @@ class Map(Format):
             K[1, 2] -= first
             strip = replace(camera, K=K, height=min(rows, camera.height - first))
             there = torch.from_numpy(np.isfinite(known[first : first + rows]))
-            view = partial(moment.module.renderer.values_seen, shapes, camera=strip)
-            depth, spread = closest_depth(view, seen.means, strip, there)
+            depth, spread = closest_depth(partial(moment.module.renderer.depths_at_shares, shapes, strip), there)
             clear = spread * place.scale < beyond  # else it is fog
             found.append((top - place.scale * depth.double()).where(clear, torch.nan))
         heights = torch.cat(found)
