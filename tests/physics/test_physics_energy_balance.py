@@ -122,7 +122,8 @@ def test_films_that_dry_in_the_sun_under_hourly_weather_are_those_of_a_stiff_sol
     rain[5:7], rain[15:17] = 1.0 / 3600, 2.0 / 3600
     climate, surface = Climate(replace(given, rain=rain)), bodies(wind=True)
     moments = torch.arange(0.0, 86_400.0, 900.0, dtype=torch.float64)
-    off = (marching.march(climate, surface, moments)[..., 0].T - solved(climate.drivers, surface, moments)).abs()
+    exact = solved(climate.drivers, surface, moments, atol=1e-7)  # at 1e-8 LSODA gives up where films break up
+    off = (marching.march(climate, surface, moments)[..., 0].T - exact).abs()
     assert off.mean() < 0.12 and off.flatten().quantile(0.98) < 1.0 and off.max() < 5.0
 
 

@@ -60,12 +60,15 @@ def showers(given: Drivers) -> Drivers:
     return replace(given, vapour=vapour, rain=rain, dries=drying_mm_s_k(Weather(given.times_s)), holds_mm=0.3)
 
 
-def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch.Tensor | None = None) -> torch.Tensor:
+def solved(
+    given: Drivers, surface: Surface, moments: torch.Tensor, about: torch.Tensor | None = None, atol: float = 1e-8
+) -> torch.Tensor:
     """Temperatures x [n, F] of surfaces with normals, what is behind them and the water on them, at moments [F] by LSODA, one
     interval of the record at a time.
 
     Args:
         about: temperatures [n] about which T⁴ and wind are linearised; None solves the full balance.
+        atol: of the solver, in kelvin and mm.
     """
     reference, times = given.reference_k, given.times_s.numpy()
     rate, share, sun = surface.log_rate.exp().numpy(), surface.share.numpy(), surface.sun.numpy()
@@ -132,7 +135,7 @@ def solved(given: Drivers, surface: Surface, moments: torch.Tensor, about: torch
             jacobian[own, own] = -rate * (exchange + kappa + leak)
             return jacobian
 
-        options = {"tfirst": True, "rtol": 1e-8, "atol": 1e-8, "mxstep": 100_000}
+        options = {"tfirst": True, "rtol": 1e-8, "atol": atol, "mxstep": 100_000}
         options |= {"Dfun": slopes} if given.vapour is None else {"hmax": 60.0, "rtol": 1e-7}
         state = odeint(slope, state, (begin, end), **options)[-1]
         found[end] = state[:count]
