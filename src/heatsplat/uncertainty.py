@@ -249,7 +249,7 @@ class Uncertainty:
         """Standard deviation [H, W] of the temperature in each pixel of the image of a frame."""
         variance = self._variances(frame, (self.stretch,)) @ self.shares
         frame = replace(frame, camera=self.module.cameras.of(frame))
-        unseen = ~covered(frame.camera, self.module.depth(frame), self._sightings)
+        unseen = ~covered(frame.camera, self.module.surface(frame), self._sightings)
         return (variance + unseen * self.prior**2).sqrt().mul(self.unit).float()
 
     def of_attributes(self, frame: Frame) -> dict[str, Tensor]:
@@ -413,7 +413,7 @@ class Uncertainty:
 
     @cached_property
     def _sightings(self) -> list[Sighting]:
-        return sightings(self.module.scene, self.module.depth)
+        return sightings(self.module.scene, self.module.surface)
 
 
 class _Block:

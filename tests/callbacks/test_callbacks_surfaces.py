@@ -18,19 +18,22 @@ from heatsplat.geometry.looks import Look, surface_points
 from heatsplat.io.tables import read_csv
 
 
-def render(frame, depth, camera):
+def surface(frame):
+    return torch.full((frame.camera.height, frame.camera.width), 4.0)
+
+
+def render(frame, camera):
     """The wall in z = 4: a warm patch of 0.5 x 0.4 about (-0.5, 0.1), all else at 0.1."""
-    away = torch.full((camera.height, camera.width), 4.0)
-    points = surface_points(camera, away)
+    points = surface_points(camera, surface(frame))
     patch = ((points[..., 0] + 0.5).abs() < 0.25) & ((points[..., 1] - 0.1).abs() < 0.2)
     image = torch.where(patch, warmth(frame.time_s).float(), torch.tensor(0.1) + 0.001 * points[..., 0].float())
-    return SimpleNamespace(features=image[..., None], depth=away, alpha=torch.ones(1, *away.shape))
+    return SimpleNamespace(features=image[..., None])
 
 
 @pytest.mark.parametrize("origin", [None, [599456.5, 5695495.25, -20.0]])
 def test_the_warm_patch_is_found_in_the_coordinates_of_the_data_set(tmp_path, origin):
     scene = wall() if origin is None else replace(wall(), notes={"origin": origin})
-    module = SimpleNamespace(scene=scene, modality="thermal", output_dir=tmp_path, render=render)
+    module = SimpleNamespace(scene=scene, modality="thermal", output_dir=tmp_path, render=render, surface=surface)
     ExtremeSurfaces(views=4, share=0.02).on_test_epoch_end(None, module)
     rows = read_csv(tmp_path / SURFACES_FILE)
     hottest, times = rows[0], module.scene.train.times_s
@@ -60,6 +63,7 @@ def test_what_masks_leave_out_is_no_surface(tmp_path):
         modality="thermal",
         output_dir=tmp_path,
         render=render,
+        surface=surface,
     )
     ExtremeSurfaces(views=4, share=0.02).on_test_epoch_end(None, module)
     rows = read_csv(tmp_path / SURFACES_FILE)
@@ -73,7 +77,9 @@ def test_surfaces_are_seen_without_what_is_known_of_single_images(tmp_path, time
     views = scene.train
     if not timed:
         views = ViewSet([replace(frame, time_s=None) for frame in views.frames], lambda i: scene.train[i])
-    module = SimpleNamespace(scene=replace(scene, train=views), modality="thermal", output_dir=tmp_path)
+    module = SimpleNamespace(
+        scene=replace(scene, train=views), modality="thermal", output_dir=tmp_path, surface=surface
+    )
     module.render = lambda frame, **asked: seen.append(frame) or render(replace(frame, time_s=0.0), **asked)
     ExtremeSurfaces(views=4, share=0.02).on_test_epoch_end(None, module)
     taken = {frame.frame_id for frame in scene.frames}
@@ -107,7 +113,7 @@ def test_surfaces_have_a_place_on_the_earth_where_cameras_do(place):
 def test_areas_are_in_metres_where_cameras_have_positions(tmp_path, monkeypatch, place, caplog, metres, area):
     monkeypatch.setattr(surfaces, "placed", lambda scene: place)
     scene = replace(wall(), positions="frames.csv", metres_per_unit=metres)
-    module = SimpleNamespace(scene=scene, modality="thermal", output_dir=tmp_path, render=render)
+    module = SimpleNamespace(scene=scene, modality="thermal", output_dir=tmp_path, render=render, surface=surface)
     with caplog.at_level(logging.INFO):
         ExtremeSurfaces(views=4, share=0.02).on_test_epoch_end(None, module)
     hottest = read_csv(tmp_path / SURFACES_FILE)[0]

@@ -25,7 +25,7 @@ def far_off(tmp_path_factory):
 def test_hot_surfaces_lie_where_rays_of_the_same_camera_meet_them(far_off):
     frame = far_off.scene.train.frames[2]
     seen = look(far_off, frame)
-    assert torch.equal(seen.depth, far_off.depth(frame)) and seen.camera is frame.camera
+    assert torch.equal(seen.depth, far_off.surface(frame)) and seen.camera is frame.camera
     moved = far_off.render(frame, depth=True)
     assert not torch.equal(surface_depth(moved.depth, moved.alpha[0]), seen.depth)
 

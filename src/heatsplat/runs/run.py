@@ -249,7 +249,7 @@ class Trained:
     def seen(self, frame: Frame) -> Tensor:
         """Which pixels of the image of a frame show what some training view has seen, [H, W] bool (``geometry.coverage``)."""
         frame = replace(frame, camera=self.module.cameras.of(frame))
-        return covered(frame.camera, self.module.depth(frame), self._sightings)
+        return covered(frame.camera, self.module.surface(frame), self._sightings)
 
     def depth(self, frame: Frame) -> Tensor:
         """Camera z [H, W] of the surface in a frame, in world units; infinite where there is none (``SceneModel.surface``)."""
@@ -269,7 +269,7 @@ class Trained:
 
     @cached_property
     def _sightings(self) -> list[Sighting]:
-        return sightings(self.scene, self.module.depth)
+        return sightings(self.scene, self.module.surface)
 
 
 def load(

@@ -175,21 +175,16 @@ class SceneModel(pl.LightningModule):
         return {name: seen.clamp(0, 1) for name, seen in zip(names, images, strict=True)}
 
     @torch.no_grad()
-    def depth(self, frame: Frame) -> Tensor:
-        """Camera z [H, W] of the surface in a frame, in world units, on the CPU; infinite where there is none. It is that of the
-        frame's camera as it is given, by whose rays it is read."""
-        output = self.render(frame, depth=True, camera=frame.camera)
-        return surface_depth(output.depth, output.alpha[0]).cpu()
-
-    @torch.no_grad()
     def surface(self, frame: Frame) -> Tensor:
-        """Camera z [H, W] of the surface in a frame, in world units, on the CPU; infinite where there is none.
+        """Camera z [H, W] of the surface in a frame, in world units, on the CPU; infinite where there is none. It is that of the
+        frame's camera as it is given, by whose rays it is read.
 
-        Where opacity is spread before or behind a surface it is nearer to the truth than ``depth`` (``geometry.closest_depth``).
-        Of fields it is ``depth``.
+        The mean depth of splats is far off where opacity is spread before or behind a surface; this is where it lies closest
+        (``geometry.closest_depth``). Fields have no splats, and their mean depth.
         """
         if self.thermal.rows == NOTHING:
-            return self.depth(frame)
+            output = self.render(frame, depth=True, camera=frame.camera)
+            return surface_depth(output.depth, output.alpha[0]).cpu()
         *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
         return closest_depth(partial(self.renderer.depths_at_shares, (*shape, opacities[:1]), frame.camera))[0]
 

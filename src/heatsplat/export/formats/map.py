@@ -21,7 +21,7 @@ from heatsplat.export.moment import Moment
 from heatsplat.export.place import AUTO, Place, place_in_file
 from heatsplat.export.seams import comparison, mosaic, shift_between, smoothed
 from heatsplat.geometry.closest_depth import closest_depth
-from heatsplat.geometry.coverage import OPEN, covered, gap_free, seen_means, surface_depth
+from heatsplat.geometry.coverage import OPEN, covered, gap_free, seen_means
 from heatsplat.geometry.looks import surface_points
 from heatsplat.geometry.projection import view_matrix
 from heatsplat.io.pictures import (
@@ -128,7 +128,8 @@ class Map(Format):
         grid = from_origin(west, north, pixel, pixel)
         other = None if self.against is None else self._other(rasterio, grid, width, height)
         camera = _from_above(scene, place, west, north, pixel, width, height)
-        depth, bands = self._bands(moment, camera)
+        depth, spread = _surface(moment, camera)
+        bands = self._bands(moment, camera, depth)
         title, own = next(iter(bands.items()))
         if other is not None and other.title not in (None, title):
             raise SceneError(
@@ -136,7 +137,8 @@ class Map(Format):
                 "temperatures, or of two on greys"
             )
         if self.height:
-            bands[f"{HEIGHT} [{place.unit}]"] = self._heights(moment, place, camera, pixel, bands[title])
+            heights = self._heights(scene, place, camera, pixel, depth, spread)
+            bands[f"{HEIGHT} [{place.unit}]"] = np.where(np.isfinite(own), heights, np.nan)
         areas = [] if self.isotherm is None else areas_of(own, self.isotherm, grid, self.least_area)
         log.info("map of %d x %d pixels of %.3g %s", width, height, pixel, place.unit)
         with rasterio.open(
@@ -223,41 +225,32 @@ class Map(Format):
         return west, north, pixel, width, height
 
     @staticmethod
-    def _heights(moment: Moment, place: Place, camera: Camera, pixel: float, known: np.ndarray) -> np.ndarray:
-        """Height of the surface [H, W] in the map's unit; NaN where the first band, ``known``, is, and where opacity is spread
-        over more height than the scene's points have."""
-        seen = moment.seen
-        shapes = seen.means, seen.quats, seen.scales, seen.opacities[None]
-        levels = place(moment.module.scene.points)[:, 2]
+    def _heights(
+        scene: SceneData, place: Place, camera: Camera, pixel: float, depth: Tensor, spread: Tensor
+    ) -> np.ndarray:
+        """Height of the surface [H, W] in the map's unit; NaN where there is none, or opacity is spread over more height than the
+        scene's points have."""
+        levels = place(scene.points)[:, 2]
         low, high = (quantile(levels, share).item() for share in (0.005, 0.995))
         beyond = high - low + WIDE * pixel  # as far as things stand out of it, or it is flat
         top = float(place(camera.center[None])[0, 2])
-        found, rows = [], max(1, AT_ONCE // camera.width)
-        for first in range(0, camera.height, rows):
-            K = camera.K.clone()
-            K[1, 2] -= first
-            strip = replace(camera, K=K, height=min(rows, camera.height - first))
-            there = torch.from_numpy(np.isfinite(known[first : first + rows]))
-            depth, spread = closest_depth(partial(moment.module.renderer.depths_at_shares, shapes, strip), there)
-            clear = spread * place.scale < beyond  # else it is fog
-            found.append((top - place.scale * depth.double()).where(clear, torch.nan))
-        heights = torch.cat(found)
+        clear = spread * place.scale < beyond  # else it is fog
+        heights = (top - place.scale * depth.double()).where(clear, torch.nan)
         return heights.where((heights > low - beyond) & (heights < high + beyond), torch.nan).numpy()
 
-    def _bands(self, moment: Moment, camera: Camera) -> tuple[Tensor, dict[str, np.ndarray]]:
-        """Depth of the surface [H, W] in the map's camera, and the bands by name."""
+    def _bands(self, moment: Moment, camera: Camera, depth: Tensor) -> dict[str, np.ndarray]:
+        """The bands by name, of the map's camera and the depth of the surface [H, W] in it."""
         seen, module = moment.seen, moment.module
         told = extra_columns(moment)
         columns = torch.stack([moment.blended, *told.values()], dim=1)
         values = gap_free(columns)
         with torch.no_grad():
             shapes = seen.means, seen.quats, seen.scales, seen.opacities[None]
-            output = module.renderer.values_seen(shapes, values, camera, depth=True)
+            output = module.renderer.values_seen(shapes, values, camera)
         means = seen_means(output.features, output.alpha[0], columns.shape[1])
         means = means.where(output.alpha[0, ..., None] >= OPEN, torch.nan)
-        depth = surface_depth(output.depth, output.alpha[0])
         if self.unseen == "nan":
-            known = covered(camera, depth, sightings(module.scene, module.depth))
+            known = covered(camera, depth, sightings(module.scene, module.surface)).to(means.device)
             means = means.where(known[..., None], torch.nan)
         unit = seen.unit.replace("°", "deg ")
         unit = f" [{unit}]" if unit else ""
@@ -272,7 +265,7 @@ class Map(Format):
             bands[f"{DEVIATION}{unit}"] = deviation.where(means[..., 0].isfinite().cpu(), torch.nan).numpy()
             for name, spread in certainty.attribute_deviations(frame).items():
                 intervals[f"{name} {DEVIATION}"] = spread.where(maps[name].isfinite().cpu(), torch.nan).numpy()
-        return depth, bands | {name: values.numpy() for name, values in maps.items()} | intervals
+        return bands | {name: values.numpy() for name, values in maps.items()} | intervals
 
 
 def _method(moment: Moment) -> str:
@@ -368,6 +361,19 @@ def _picture(
     title = moment.module.scene.name + ("" if moment.time_s is None else f" after {said(moment.time_s)}")
     title += f", north up, {place.crs}" if place.crs else ""
     return compose([Panel(np.asarray(page), title, Bar(low, high, moment.seen.unit or IMAGE_VALUES))])
+
+
+def _surface(moment: Moment, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Depth [H, W] of the surface in a camera, and over how much depth its opacity lies (``geometry.closest_depth``)."""
+    seen, found = moment.seen, []
+    shapes, rows = (seen.means, seen.quats, seen.scales, seen.opacities[None]), max(1, AT_ONCE // camera.width)
+    for first in range(0, camera.height, rows):
+        K = camera.K.clone()
+        K[1, 2] -= first
+        strip = replace(camera, K=K, height=min(rows, camera.height - first))
+        found.append(closest_depth(partial(moment.module.renderer.depths_at_shares, shapes, strip)))
+    depth, spread = (torch.cat(strips) for strips in zip(*found, strict=True))
+    return depth, spread
 
 
 def _from_above(
