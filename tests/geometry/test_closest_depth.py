@@ -32,7 +32,7 @@ def layers(*opacity_at: tuple[float, float]):
 
 
 def found(shapes, camera, mask=None):
-    return closest_depth(partial(RENDERER.depths_at_shares, shapes, camera), mask)
+    return closest_depth(partial(RENDERER.depths_at_shares, shapes), camera, mask)
 
 
 def test_fog_before_a_wall_and_clutter_behind_it_do_not_move_it(camera):
@@ -63,3 +63,14 @@ def test_a_mask_and_open_pixels_are_infinite(camera):
     assert depth[:, :10].isinf().all() and spread[:, :10].isinf().all() and depth[:, 10:].isfinite().all()
     depth, spread = found(layers((0.01, WALL)), camera)
     assert depth.isinf().all() and spread.isinf().all()
+
+
+def test_a_large_image_is_looked_at_in_strips(camera, monkeypatch):
+    shapes = layers(*[(0.03, WALL + 0.02 * i) for i in range(60)])
+    mask = torch.rand(24, 32, generator=torch.Generator().manual_seed(0)) > 0.3
+    whole = found(shapes, camera, mask)
+    monkeypatch.setattr("heatsplat.geometry.closest_depth.AT_ONCE", 32 * 5)
+    for one, other in zip(whole, found(shapes, camera, mask), strict=True):
+        assert torch.equal(one.isinf(), other.isinf())
+        torch.testing.assert_close(other[mask], one[mask], atol=0.05, rtol=0)
+    assert whole[1][mask].median() > 0.05

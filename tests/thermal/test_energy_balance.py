@@ -91,6 +91,23 @@ def test_it_emits_temperatures_and_all_that_it_learns_gets_a_gradient(solution):
         assert (splats[name].grad[0] == 0).all(), name
 
 
+@pytest.mark.parametrize(
+    "options",
+    [{"solution": "linear"}, {"solution": "linear", "nodes": 2}, {"solution": "linear", "semi_infinite": True}, {}],
+    ids=str,
+)
+def test_temperatures_of_many_times_are_those_of_each(options):
+    model, splats = ready(**options)
+    times, ids = [0.0, 3.1 * HOUR, 3.2 * HOUR, 11 * HOUR, 24 * HOUR], torch.tensor([2, 5, 0])
+    with torch.no_grad():
+        together = model.temperatures(splats, times, ids)
+        alone = torch.stack([model.temperature(splats, time_s)[ids] for time_s in times])
+        torch.testing.assert_close(together, alone, atol=2e-4, rtol=0)
+        assert (together.diff(dim=0).abs() > 0.01).any(1).all()
+        with pytest.raises(SceneError, match="there is no weather for second"):
+            model.temperatures(splats, [0.0, 1e9])
+
+
 def test_both_solutions_agree_within_what_linearising_costs():
     models = [ready(solution=solution) for solution in ("linear", "corrected")]
     linear, corrected = (torch.stack([m.temperature(s, h * HOUR) for h in range(0, 30, 3)]) for m, s in models)

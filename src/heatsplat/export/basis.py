@@ -23,9 +23,8 @@ TURNED = 2  # how often it is turned towards the values
 ROWS = 16384  # Gaussians that are fitted together
 CELLS = 1 << 20  # values that are asked for at once: some moments of few Gaussians, or one of many
 NARROWEST = 1e-6  # of the span: intervals that are halved no further, where values jump
-ALIKE = (
-    1 / 4
-)  # of the worst error, from which on intervals are halved together: smooth ones err by as much, half as wide
+# Of the worst error, from which on intervals are halved together: half as wide, smooth ones err by as much.
+ALIKE = 1 / 4
 STEPS = 32767  # of a coefficient of 16 bits, to each side
 WEIGHED = 4  # times that Gaussians with larger errors get more weight in the curves
 # Shares of the tolerance: between samples, for want of curves, of a step of coefficients; and what may be found at checks, of

@@ -35,7 +35,7 @@ def closest(moment: Moment, view: View) -> tuple[Tensor, Tensor]:
     moment = moment if moment.whole is None else moment.whole
     seen, camera = moment.seen, view.frame.camera
     shapes = seen.means, seen.quats, seen.scales, seen.opacities[None]
-    return closest_depth(partial(moment.module.renderer.depths_at_shares, shapes, camera), view.mask)
+    return closest_depth(partial(moment.module.renderer.depths_at_shares, shapes), camera, view.mask)
 
 
 def made_surface(

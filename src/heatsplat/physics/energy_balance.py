@@ -46,6 +46,7 @@ stays constant.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -207,6 +208,10 @@ class Climate:
 
     def linear_temperature(self, surface: Surface, time_s: float) -> Tensor:
         """Temperature x at a moment of the record with T⁴ and wind linearised about the surface's own mean, [n]."""
+        return self.linear_temperatures(surface, [time_s])[0]
+
+    def linear_temperatures(self, surface: Surface, times_s: Sequence[float]) -> Tensor:
+        """``linear_temperature`` at several moments, [T, n], about one mean."""
         stiffness = self._stiffness(surface)
         mean, constant = 0.0 if stiffness is None else self.mean_temperature(surface), surface.inner
         if surface.share is not None:
@@ -214,10 +219,15 @@ class Climate:
             bent = surface.share * (steep * mean - power_excess(mean, self.drivers.reference_k))
             constant = bent if constant is None else constant + bent
             stiffness = (stiffness + surface.share * steep).clamp(min=MIN_STIFFNESS)
-        elapsed = time_s - float(self.drivers.times_s[0])
+        log_rate, rates = surface.log_rate, None
+        if surface.core is not None:
+            rates = _two_rates(surface.core, surface.log_rate, 1.0 if stiffness is None else stiffness)
+        elif stiffness is not None:  # a holds the square of H
+            log_rate = log_rate + (2 * stiffness.log() if self.semi_infinite else stiffness.log())
 
-        def response(log_rate: Tensor) -> tuple[Tensor, Tensor]:
+        def response(time_s: float, log_rate: Tensor) -> tuple[Tensor, Tensor]:
             """What a body of this one rate follows, before it is divided by its stiffness, and what it keeps of its start."""
+            elapsed = time_s - float(self.drivers.times_s[0])
             settled = interpolate(self.table.at(time_s).to(log_rate), *grid_position(log_rate, self.table.log_rates))
             beam = 0.0 if self.beam is None else self._beam(time_s, surface, log_rate).to(log_rate)
             if self.semi_infinite:
@@ -227,19 +237,18 @@ class Climate:
             forced = self.forcing(surface, settled, beam, mean)
             return forced if constant is None else forced + constant * (1 - kept), kept
 
-        if surface.core is None:
-            log_rate = surface.log_rate
-            if stiffness is not None:  # a holds the square of H
-                log_rate = log_rate + (2 * stiffness.log() if self.semi_infinite else stiffness.log())
-            forced, kept = response(log_rate)
-            left = surface.start * kept
-        else:
-            rates = _two_rates(surface.core, surface.log_rate, 1.0 if stiffness is None else stiffness)
-            (fast, fast_kept), (slow, slow_kept) = map(response, rates.log_rates)
-            forced = slow + rates.share * (fast - slow)
-            left = surface.start * (slow_kept + rates.own * (fast_kept - slow_kept))
-            left = left + surface.core.start * rates.of_core * (slow_kept - fast_kept)
-        return left + (forced if stiffness is None else forced / stiffness)
+        def at(time_s: float) -> Tensor:
+            if rates is None:
+                forced, kept = response(time_s, log_rate)
+                left = surface.start * kept
+            else:
+                (fast, fast_kept), (slow, slow_kept) = (response(time_s, rate) for rate in rates.log_rates)
+                forced = slow + rates.share * (fast - slow)
+                left = surface.start * (slow_kept + rates.own * (fast_kept - slow_kept))
+                left = left + surface.core.start * rates.of_core * (slow_kept - fast_kept)
+            return left + (forced if stiffness is None else forced / stiffness)
+
+        return torch.stack([at(time_s) for time_s in times_s])
 
     def _beam(self, time_s: float, surface: Surface, log_rate: Tensor) -> Tensor:
         """Response [n] to the sun's beam; that of a semi-infinite body from so few rates that 0.3 % of it are missed."""

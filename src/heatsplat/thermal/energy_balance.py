@@ -310,11 +310,15 @@ class EnergyBalance(ThermalModel):
         return self._temperature(splats, Query(ids, time_s=time_s)) + self.reference_k.item()
 
     def temperatures(self, splats: Splats, times_s: Sequence[float], ids: Tensor | None = None) -> Tensor:
-        if self.options.linear or torch.is_grad_enabled():
+        if torch.is_grad_enabled():
             return super().temperatures(splats, times_s, ids)
         for time_s in (times_s[0], times_s[-1]):
             self._check_time(time_s)
-        return self._course_of(splats).temperatures(times_s, ids) + self.reference_k.item()
+        if self.options.linear:
+            found = self.climate.linear_temperatures(self._surface(splats, Query(ids)), times_s)
+        else:
+            found = self._course_of(splats).temperatures(times_s, ids)
+        return found + self.reference_k.item()
 
     def on_step(self, step: int) -> None:
         self._step = step
@@ -420,6 +424,7 @@ class EnergyBalance(ThermalModel):
         return self._kept.temperature(surface, query.time_s, ids, given, splats[MARCHED_AT].detach())
 
     def _check_time(self, time_s: float) -> None:
+        """Raises SceneError where the record does not hold a moment."""
         times = self.climate.drivers.times_s
         first, last = float(times[0]), float(times[-1])
         if not first <= time_s <= last:

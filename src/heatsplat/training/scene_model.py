@@ -186,7 +186,7 @@ class SceneModel(pl.LightningModule):
             output = self.render(frame, depth=True, camera=frame.camera)
             return surface_depth(output.depth, output.alpha[0]).cpu()
         *shape, opacities = self._shapes(self.thermal.geometry(self.splats, _query(frame)))
-        return closest_depth(partial(self.renderer.depths_at_shares, (*shape, opacities[:1]), frame.camera))[0]
+        return closest_depth(partial(self.renderer.depths_at_shares, (*shape, opacities[:1])), frame.camera)[0]
 
     @contextmanager
     def showing(self, splats: Splats) -> Iterator[None]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,6 @@ AWAY = 1000.0  # half widths of the map from which it is seen: what stands h hig
 LARGEST = 8192  # pixels of a side
 DEVIATION = "standard deviation"  # band of it
 HEIGHT = "height"  # band of it
-AT_ONCE = 1 << 18  # pixels whose height is found together, in 100 MB
 WIDE = 10  # pixels that a flat scene may be high
 NUMBERED = 30  # areas in a picture
 SHOWN = 1600  # pixels of the longer side of a picture at most
@@ -128,7 +127,9 @@ class Map(Format):
         grid = from_origin(west, north, pixel, pixel)
         other = None if self.against is None else self._other(rasterio, grid, width, height)
         camera = _from_above(scene, place, west, north, pixel, width, height)
-        depth, spread = _surface(moment, camera)
+        seen = moment.seen
+        shapes = seen.means, seen.quats, seen.scales, seen.opacities[None]
+        depth, spread = closest_depth(partial(moment.module.renderer.depths_at_shares, shapes), camera)
         bands = self._bands(moment, camera, depth)
         title, own = next(iter(bands.items()))
         if other is not None and other.title not in (None, title):
@@ -361,19 +362,6 @@ def _picture(
     title = moment.module.scene.name + ("" if moment.time_s is None else f" after {said(moment.time_s)}")
     title += f", north up, {place.crs}" if place.crs else ""
     return compose([Panel(np.asarray(page), title, Bar(low, high, moment.seen.unit or IMAGE_VALUES))])
-
-
-def _surface(moment: Moment, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Depth [H, W] of the surface in a camera, and over how much depth its opacity lies (``geometry.closest_depth``)."""
-    seen, found = moment.seen, []
-    shapes, rows = (seen.means, seen.quats, seen.scales, seen.opacities[None]), max(1, AT_ONCE // camera.width)
-    for first in range(0, camera.height, rows):
-        K = camera.K.clone()
-        K[1, 2] -= first
-        strip = replace(camera, K=K, height=min(rows, camera.height - first))
-        found.append(closest_depth(partial(moment.module.renderer.depths_at_shares, shapes, strip)))
-    depth, spread = (torch.cat(strips) for strips in zip(*found, strict=True))
-    return depth, spread
 
 
 def _from_above(
