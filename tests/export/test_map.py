@@ -109,7 +109,7 @@ def test_the_last_band_is_the_height_of_the_surface(two_plates, tmp_path, monkey
     """Also of a map that is looked at in strips, and of places that float32 tells to a millimetre only by the camera."""
     form = Map(resolution=0.02, bounds=[-3, -3, 3, 3], above=[0, 0, 1], unseen="keep", height=True)
     form.write(two_plates, tmp_path / "a.tif")
-    monkeypatch.setattr("heatsplat.export.formats.map.AT_ONCE", 7 * 300)
+    monkeypatch.setattr("heatsplat.geometry.closest_depth.AT_ONCE", 7 * 300)
     form.write(two_plates, tmp_path / "strips.tif")
     places = place_of(two_plates.module.scene, above=torch.tensor([0.0, 0.0, 1.0]))(two_plates.seen.means).tolist()
     with rasterio.open(tmp_path / "a.tif") as found, rasterio.open(tmp_path / "strips.tif") as strips:
