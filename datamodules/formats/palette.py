@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -102,6 +103,7 @@ def _remedy(key: str) -> str:
     return f"one of {NAMES}, or the picture of the colour bar alone, cut out of one of the images ({key}=bar.png)"
 
 
+@cache  # images in doubt are compared with all of them, each time
 def named(name: str) -> Palette | None:
     """The palette of a name, or None."""
     base = name.removesuffix(REVERSED)
