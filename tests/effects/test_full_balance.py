@@ -49,7 +49,7 @@ def seen() -> tuple[torch.Tensor, torch.Tensor]:
 
         start = np.array([290.0 + draw(-4.0, 4.0), 288.0])
         course = solve_ivp(
-            change, (times[0], moments[-1]), start, "Radau", moments, rtol=1e-7, atol=1e-5, max_step=HOUR_S / 4
+            change, (times[0], moments[-1]), start, "LSODA", moments, rtol=1e-7, atol=1e-5, max_step=HOUR_S / 4
         )
         values.append(course.y[0] - KELVIN_AT_0_C)
     return torch.from_numpy(moments), torch.from_numpy(np.array(values))
