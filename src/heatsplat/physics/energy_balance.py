@@ -46,7 +46,7 @@ stays constant.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -208,10 +208,10 @@ class Climate:
 
     def linear_temperature(self, surface: Surface, time_s: float) -> Tensor:
         """Temperature x at a moment of the record with T⁴ and wind linearised about the surface's own mean, [n]."""
-        return self.linear_temperatures(surface, [time_s])[0]
+        return self.linear_course(surface)(time_s)
 
-    def linear_temperatures(self, surface: Surface, times_s: Sequence[float]) -> Tensor:
-        """``linear_temperature`` at several moments, [T, n], about one mean."""
+    def linear_course(self, surface: Surface) -> Callable[[float], Tensor]:
+        """What gives ``linear_temperature`` at any moment, about one mean."""
         stiffness = self._stiffness(surface)
         mean, constant = 0.0 if stiffness is None else self.mean_temperature(surface), surface.inner
         if surface.share is not None:
@@ -248,7 +248,7 @@ class Climate:
                 left = left + surface.core.start * rates.of_core * (slow_kept - fast_kept)
             return left + (forced if stiffness is None else forced / stiffness)
 
-        return torch.stack([at(time_s) for time_s in times_s])
+        return at
 
     def _beam(self, time_s: float, surface: Surface, log_rate: Tensor) -> Tensor:
         """Response [n] to the sun's beam; that of a semi-infinite body from so few rates that 0.3 % of it are missed."""

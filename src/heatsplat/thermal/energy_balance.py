@@ -315,7 +315,8 @@ class EnergyBalance(ThermalModel):
         for time_s in (times_s[0], times_s[-1]):
             self._check_time(time_s)
         if self.options.linear:
-            found = self.climate.linear_temperatures(self._surface(splats, Query(ids)), times_s)
+            at = self.climate.linear_course(self._surface(splats, Query(ids)))
+            found = torch.stack([at(time_s) for time_s in times_s])
         else:
             found = self._course_of(splats).temperatures(times_s, ids)
         return found + self.reference_k.item()
